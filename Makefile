@@ -1,0 +1,57 @@
+# make demo   denoise the examples           make test   linters, types, and the tests against the built wheel
+# Both make their own virtual environment in .venv and need nothing before them but Python 3.11 or newer.
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DELETE_ON_ERROR:
+.ONESHELL:
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(abspath $(VENV))/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+SOURCES := $(shell find deep_io lbmc_cli model pipelines -type f -not -path '*/__pycache__/*')
+TESTBED := build/testbed
+
+.PHONY: demo test lint clean
+.DEFAULT_GOAL := demo
+
+$(VENV)/made:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "ERROR: Python 3.11 or newer is needed, this is "
+	    + sys.version.split()[0] + "; name another with: make PYTHON=python3.12")'
+	$(PYTHON) -m venv --clear $(VENV)
+	$(PIP) install -c constraints.txt setuptools
+	touch $@
+
+build/wheel: $(VENV)/made setup.cfg pyproject.toml README.md $(SOURCES)
+	rm -rf build/wheel build/lib build/bdist.*
+	$(PIP) wheel --no-deps --no-build-isolation --wheel-dir build/wheel .
+
+# The wheel itself is put in anew each time (same version, new contents); what it depends on stays.
+$(VENV)/runtime: build/wheel constraints.txt
+	$(PIP) install -c constraints.txt build/wheel/*.whl
+	$(PIP) install --no-deps --force-reinstall build/wheel/*.whl
+	touch $@
+
+$(VENV)/tested: build/wheel constraints.txt
+	wheel=$$(echo build/wheel/*.whl)
+	$(PIP) install -c constraints.txt "$$wheel[test]"
+	$(PIP) install --no-deps --force-reinstall "$$wheel"
+	touch $@
+
+demo: $(VENV)/runtime
+	@PATH=$(BIN):$$PATH bash examples/demo.sh
+
+lint: $(VENV)/tested
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+# The tests run beside a copy of themselves, not beside the sources: what they import is the installed wheel.
+test: lint
+	rm -rf $(TESTBED) && mkdir -p $(TESTBED)
+	for item in tests examples benchmarks docs README.md pyproject.toml constraints.txt; do
+	  if [ -e "$$item" ]; then cp -r "$$item" $(TESTBED)/; fi
+	done
+	cd $(TESTBED) && env -u PYTHONPATH $(BIN)/python -P -m pytest
+
+clean:
+	rm -rf build $(VENV)

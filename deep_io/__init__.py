@@ -1,0 +1,1 @@
+"""Files to arrays and back: deep and flat EXRs, roles, weighting, sequences. Never networks."""

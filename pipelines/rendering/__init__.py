@@ -1,0 +1,1 @@
+"""Training scenes: random scenes, rendered with Mitsuba into deep sample files with references."""

@@ -1,0 +1,1 @@
+"""Training: the data cache, the training loop, its curves and checkpoints."""
