@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+from pipelines.progress import ProgressKind
+
 ALL_LAYERS = 5
 """Weights hold logits for this many layers; a job keeps between one and all of them."""
 
@@ -18,7 +20,6 @@ NormalSpace = Literal["auto", "world", "view"]
 DepthKind = Literal["z", "distance"]
 PixelType = Literal["half", "float"]
 Precision = Literal["auto", "fp32", "bf16", "fp16"]
-ProgressKind = Literal["auto", "bar", "plain", "openjd", "none"]
 
 COMPRESSIONS = ("none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab")
 """Flat EXR compressions that every reader knows; ZSTD is left out, since older tools and Nuke cannot read it."""

@@ -1,0 +1,168 @@
+"""The `lbmc` command: the table of its subcommands, and how a run ends (exit codes, error lines, signals).
+
+Nothing heavy is imported here: a subcommand's module is imported when it runs, and its pipeline when it starts work.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import traceback
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import click
+
+COMMANDS = {
+    "denoise": "Denoise a deep sample file, or a sequence of them, to a flat beauty.",
+    "info": "Show what a deep sample file holds and how it would be read.",
+    "pack": "Pack one-sample flat renders into one deep sample file.",
+    "compare": "Measure an image against its reference.",
+    "models": "List the weights that are here.",
+}
+"""Subcommands in the order of `--help`; each lives in lbmc_cli/NAME.py as a click command of that name."""
+
+EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
+EXIT_INTERRUPTED, EXIT_TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
+
+
+class TerminatedError(BaseException):
+    """SIGTERM arrived. Not an Exception, so that only clean-up code sees it."""
+
+
+class LazyGroup(click.Group):
+    """A group whose subcommands come from COMMANDS and are imported only when one of them is called."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        name = cmd_name.replace("-", "_")
+        command: click.Command = getattr(import_module(f"lbmc_cli.{name}"), name)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+
+def _print_version(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
+    if value and not ctx.resilient_parsing:
+        from pipelines import __version__
+
+        click.echo(f"lbmc {__version__}")
+        ctx.exit()
+
+
+@click.command(
+    cls=LazyGroup,
+    context_settings={"auto_envvar_prefix": "LBMC", "help_option_names": ["-h", "--help"], "max_content_width": 110},
+)
+@click.option(
+    "--version", is_flag=True, is_eager=True, expose_value=False, callback=_print_version, help="Show version."
+)
+@click.option("--debug", is_flag=True, help="Show the traceback of an error.")
+def lbmc(debug: bool) -> None:
+    """Denoise deep EXRs whose samples are Monte Carlo path samples.
+
+    Every option can also be given as an environment variable: LBMC_THREADS for --threads of every command,
+    LBMC_DENOISE_THREADS for that of denoise alone.
+    """
+    refuse_shadowed_packages()
+
+
+def refuse_shadowed_packages() -> None:
+    """Raises ClickException where `import model` would not find the `model` that belongs to this `lbmc`.
+
+    The package names are generic; a folder of the same name on PYTHONPATH, or in the current directory of
+    `python -m`, would be imported in place of ours and fail in baffling ways.
+    """
+    home = Path(__file__).resolve().parent.parent
+    for package in ("deep_io", "model", "pipelines"):
+        spec = find_spec(package)
+        found = Path(spec.origin).resolve().parent if spec is not None and spec.origin else None
+        if found is None and spec is not None and spec.submodule_search_locations:
+            found = Path(next(iter(spec.submodule_search_locations))).resolve()
+        if found != home / package:
+            where = f"another one, {found}, comes first" if found else "it is missing"
+            cure = "take that folder off PYTHONPATH" if found else "install lbmc again"
+            raise click.ClickException(f"lbmc needs its own package {package!r} of {home}, but {where}; {cure}")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs `lbmc` with `arguments` (default: the process's own) and returns its exit code, whatever happens.
+
+    0 done; 1 some frames failed, or an unexpected error; 2 usage or a refused output; 3 an unreadable or unsuitable
+    input; 130 and 143 after SIGINT and SIGTERM. Errors are one line on stderr that starts with `ERROR:`.
+    """
+    warnings.showwarning = _show_warning
+    context: dict[str, Any] = {"debug": False}
+    try:
+        with _terminated_by_sigterm():
+            result = lbmc.main(
+                args=None if arguments is None else list(arguments),
+                prog_name="lbmc",
+                standalone_mode=False,
+                obj=context,
+            )
+        return int(result or EXIT_OK)
+    except click.exceptions.NoArgsIsHelpError as help_wanted:
+        help_wanted.show()
+        return EXIT_USAGE
+    except click.UsageError as error:
+        hint = f" (see: {error.ctx.command_path} --help)" if error.ctx is not None else ""
+        return _report(error.format_message() + hint, error.exit_code)
+    except click.ClickException as error:
+        return _report(error.format_message(), error.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        return _report("interrupted", EXIT_INTERRUPTED)
+    except TerminatedError:
+        return _report("terminated", EXIT_TERMINATED)
+    except BrokenPipeError:
+        # The reader of our output left (`lbmc info x.exr | head`); Python would complain again when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_FAILED
+    except Exception as error:
+        if context["debug"]:
+            traceback.print_exception(error)
+        from pipelines.jobs import describe_error
+
+        return _report(describe_error(error), getattr(error, "exit_code", EXIT_FAILED))
+
+
+@contextmanager
+def _terminated_by_sigterm() -> Iterator[None]:
+    """While inside, SIGTERM raises TerminatedError in the main thread, so that temporary files are removed."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def terminate(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        raise TerminatedError
+
+    previous = signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+def _report(text: str, code: int) -> int:
+    print(f"ERROR: {' '.join(text.split())}", file=sys.stderr, flush=True)
+    return code
+
+
+def _show_warning(message: Warning | str, *details: Any, **more: Any) -> None:
+    """Warnings in the same form as errors: one line, without the place in our code that raised them."""
+    print(f"WARNING: {' '.join(str(message).split())}", file=sys.stderr, flush=True)

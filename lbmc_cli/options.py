@@ -1,0 +1,146 @@
+"""What the subcommands share: the command class with --debug, options that read LBMC_* variables, parameter types."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import click
+
+_UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
+
+
+class LbmcCommand(click.Command):
+    """A subcommand: `--debug` works after its name too."""
+
+    def __init__(self, *arguments: Any, **settings: Any) -> None:
+        super().__init__(*arguments, **settings)
+        self.params.append(
+            click.Option(
+                ["--debug"],
+                is_flag=True,
+                expose_value=False,
+                callback=_note_debug,
+                help="Show the traceback of an error.",
+            )
+        )
+
+    def invoke(self, ctx: click.Context) -> Any:
+        _note_debug(ctx, None, bool(ctx.find_root().params.get("debug")))
+        return super().invoke(ctx)
+
+
+def _note_debug(ctx: click.Context, parameter: click.Parameter | None, value: bool) -> None:
+    if value and isinstance(ctx.obj, dict):
+        ctx.obj["debug"] = True
+
+
+class LbmcOption(click.Option):
+    """An option whose default may come from LBMC_<COMMAND>_<OPTION> or, for all commands at once, LBMC_<OPTION>."""
+
+    def resolve_envvar_value(self, ctx: click.Context) -> str | None:
+        value = super().resolve_envvar_value(ctx)
+        if value is None and self.name is not None:
+            root = ctx.find_root().auto_envvar_prefix
+            value = _environment(f"{root}_{self.name.upper()}") if root else None
+        return value
+
+
+def _environment(name: str) -> str | None:
+    import os
+
+    return os.environ.get(name) or None
+
+
+option: Callable[..., Callable[[Any], Any]] = partial(click.option, cls=LbmcOption)
+"""click.option, with LBMC_* variables as described at LbmcOption."""
+
+
+class ByteSize(click.ParamType[int]):
+    """A size in bytes with an optional unit: 2GiB, 512M, 1.5g; units are powers of 1024."""
+
+    name = "size"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        if isinstance(value, int):
+            return value
+        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)(?:I?B)?", str(value).strip().upper())
+        if match is None or float(match[1]) == 0.0:
+            self.fail(f"{value!r} is not a size; write 2GiB or 512MiB", param, ctx)
+        return int(float(match[1]) * _UNITS[match[2]])
+
+
+class Device(click.ParamType[str]):
+    """auto, cpu, cuda or cuda:N. Whether the device exists is found out by the job."""
+
+    name = "device"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        if re.fullmatch(r"auto|cpu|cuda(:\d+)?", str(value)) is None:
+            self.fail(f"{value!r} is not auto, cpu, cuda or cuda:N", param, ctx)
+        return str(value)
+
+
+def role_overrides(ctx: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
+    """Callback of --map: ("normal=N", ...) to {"normal": "N", ...}."""
+    overrides: dict[str, str] = {}
+    for value in values:
+        role, separator, layer = value.partition("=")
+        if not separator or not role:
+            raise click.BadParameter(f"{value!r} is not ROLE=LAYER", ctx, parameter)
+        if role in overrides:
+            raise click.BadParameter(f"role {role!r} is given twice", ctx, parameter)
+        overrides[role] = layer
+    return overrides
+
+
+def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The options that say how a deep sample file is read; the same for every command that reads one."""
+    for decorate in reversed(
+        (
+            option(
+                "--part", help="Part of a multi-part file, by name or number from 0.  [default: the only deep part]"
+            ),
+            option(
+                "--map",
+                "overrides",
+                multiple=True,
+                metavar="ROLE=LAYER",
+                callback=role_overrides,
+                help="Layer or channel that plays a role, e.g. normal=N_world; an empty LAYER drops the role. Repeatable.",
+            ),
+            option(
+                "--weighting",
+                type=click.Choice(["uniform", "packed", "over"]),
+                help="How samples are weighted.  [default: by the header; uniform where every alpha is 0 or 1]",
+            ),
+            option(
+                "--normals",
+                type=click.Choice(["auto", "world", "view"]),
+                default="auto",
+                show_default=True,
+                help="Space of the normals.",
+            ),
+            option(
+                "--depth",
+                type=click.Choice(["z", "distance"]),
+                default="z",
+                show_default=True,
+                help="Planar depth, or distance along the ray.",
+            ),
+            option("--camera", metavar="FILE", help="File that carries the camera (worldToCamera) when IN does not."),
+        )
+    ):
+        command = decorate(command)
+    return command
+
+
+PROGRESS = option(
+    "--progress",
+    type=click.Choice(["auto", "bar", "plain", "openjd", "none"]),
+    default="auto",
+    show_default=True,
+    help="auto: a bar on a terminal, else plain lines.",
+)
