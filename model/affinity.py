@@ -1,0 +1,213 @@
+"""Filtering by affinity over a pyramid: kernels whose logits come from distances between learned features.
+
+At level i a target pixel sees a small window of cells of 2^i x 2^i pixels. With f the features, u the sources' bias
+and v the targets' preference for a level, the logit of cell s for target t is
+
+    logit = u_s + v_t + log n_s + log B(t - s) - |f_t - f_s|^2
+
+where B is the quadratic B-spline over three cells (nothing for level 0), so that no cell boundary shows, and n_s the
+occupancy. One normalisation per target over all taps of all levels: out_t = sum_s softmax(logit)_s value_s.
+Targets keep their full resolution at every level, so coarse levels respect edges too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def pool_cells(log_n: Tensor, planes: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Occupancy-weighted means over size x size cells, exact in the log domain.
+
+    log_n (B, H, W), planes (B, C, H, W) -> mean occupancy's log (B, h, w), means (B, C, h, w); H and W multiples of
+    size. An empty cell has -inf and 0.
+    """
+    if size == 1:
+        return log_n, planes
+    with torch.no_grad():
+        peak = F.max_pool2d(log_n[:, None], size)  # (B, 1, h, w)
+        peak = torch.where(peak == -torch.inf, 0, peak)
+        spread = peak.repeat_interleave(size, 2).repeat_interleave(size, 3)
+    relative = torch.exp(log_n[:, None] - spread)
+    sums = F.avg_pool2d(torch.cat([relative * planes, relative], 1), size)
+    total = sums[:, -1:]
+    some = total > 0
+    safe = torch.where(some, total, 1)
+    return torch.where(some, torch.log(safe) + peak, -torch.inf)[:, 0], sums[:, :-1] / safe
+
+
+def spline_logs(size: int, window: int, like: Tensor) -> Tensor:
+    """(window, size): log of the B-spline weight of each cell of the window, for each pixel position in a cell.
+
+    The spline's support is three cells; a window of one cell has weight 1; wider windows scale it.
+    """
+    if size == 1 or window == 1:
+        return like.new_zeros(window, size)
+    position = (torch.arange(size, dtype=like.dtype, device=like.device) + 0.5) / size - 0.5  # within the own cell
+    offsets = torch.arange(window, dtype=like.dtype, device=like.device) - window // 2
+    distance = (position[None, :] - offsets[:, None]).abs() * 3 / window
+    inner = 0.75 - distance**2
+    outer = 0.5 * (1.5 - distance).clamp_min(0) ** 2
+    return torch.log(torch.where(distance <= 0.5, inner, outer))
+
+
+class _Level:
+    """One level's cells, padded by the window's radius and repeated along x to the picture's width."""
+
+    def __init__(self, size: int, window: int, bias: Tensor, features: Tensor, values: Tensor) -> None:
+        self.size, self.window, radius = size, window, window // 2
+        self.rows, self.cols = bias.shape[-2], bias.shape[-1]
+        self.bias = F.pad(bias, (radius, radius, radius, radius), value=-torch.inf)
+        self.features = F.pad(features, (radius, radius, radius, radius))
+        self.values = F.pad(values, (radius, radius, radius, radius))
+        self.log_spline = spline_logs(size, window, bias)
+        self.wide = [self._widen(plane) for plane in (self.bias, self.features, self.values)]
+
+    def _widen(self, plane: Tensor) -> Tensor:
+        return plane if self.size == 1 else plane.repeat_interleave(self.size, -1)
+
+    def narrow(self, wide: Tensor) -> Tensor:
+        """The adjoint of padding and widening: (B, C, rows + 2r, (cols + 2r) * size) -> (B, C, rows, cols)."""
+        radius = self.window // 2
+        if self.size > 1:
+            wide = wide.unflatten(-1, (-1, self.size)).sum(-1)
+        return wide[..., radius : radius + self.rows, radius : radius + self.cols]
+
+    def taps(self) -> Iterator[tuple[int, int, slice, slice]]:
+        """Every tap (dy, dx) of the window with the rows and columns of the padded, widened cells that it reads."""
+        for dy in range(self.window):
+            for dx in range(self.window):
+                start = dx * self.size
+                yield dy, dx, slice(dy, dy + self.rows), slice(start, start + self.cols * self.size)
+
+    def spline(self, dy: int, dx: int) -> Tensor:
+        """(1, size, W): log B-spline weights of this tap over the pixels of a row of cells."""
+        along_x = self.log_spline[dx].repeat(self.cols)
+        return self.log_spline[dy][:, None] + along_x[None, :]
+
+
+class _AffinityFilter(torch.autograd.Function):
+    """The tap loop with a hand-written derivative: intermediate products of 50 taps would not fit the caches."""
+
+    @staticmethod
+    def forward(ctx: Any, target: Tensor, preference: Tensor, sizes: Sequence[int], windows: Sequence[int],
+                *cells: Tensor) -> Tensor:
+        levels = _levels(sizes, windows, cells)
+        batch, _, height, width = target.shape
+        logits = target.new_empty(sum(w * w for w in windows), batch, height, width)
+        tap = 0
+        for number, level in enumerate(levels):
+            aim = target.view(batch, -1, level.rows, level.size, width)
+            wish = preference[:, number].view(batch, level.rows, level.size, width)
+            bias, features, _ = level.wide
+            for dy, dx, rows, cols in level.taps():
+                logit = logits[tap].view(batch, level.rows, level.size, width)
+                torch.add(wish, level.spline(dy, dx), out=logit)
+                logit += bias[:, rows, None, cols]
+                source = features[:, :, rows, None, cols]
+                for k in range(source.shape[1]):
+                    logit.addcmul_(aim[:, k], source[:, k], value=2.0)
+                tap += 1
+        peak = logits.amax(0)
+        peak = torch.where(peak == -torch.inf, 0, peak)
+        logits.sub_(peak).exp_()
+        total = logits.sum(0)
+        reached = total > 0
+        logits.div_(torch.where(reached, total, 1))
+        out = target.new_zeros(batch, levels[0].values.shape[1], height, width)
+        tap = 0
+        for level in levels:
+            result = out.view(batch, -1, level.rows, level.size, width)
+            values = level.wide[2]
+            for _, _, rows, cols in level.taps():
+                weight = logits[tap].view(batch, level.rows, level.size, width)
+                for k in range(result.shape[1]):
+                    result[:, k].addcmul_(weight, values[:, k, rows, None, cols])
+                tap += 1
+        ctx.save_for_backward(target, logits, out, *cells)
+        ctx.sizes, ctx.windows = sizes, windows
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
+        target, weights, out, *cells = ctx.saved_tensors
+        levels = _levels(ctx.sizes, ctx.windows, cells)
+        batch, _, height, width = target.shape
+        grad = grad.contiguous()
+        common = (grad * out).sum(1)  # (B, H, W): subtracted by the softmax's derivative
+        grad_target = torch.zeros_like(target)
+        grad_preference = target.new_zeros(batch, len(levels), height, width)
+        grad_cells: list[Tensor] = []
+        tap = 0
+        for number, level in enumerate(levels):
+            shape = (batch, -1, level.rows, level.size, width)
+            aim, pull, back = target.view(shape), grad.view(shape), grad_target.view(shape)
+            base = common.view(batch, level.rows, level.size, width)
+            wish = grad_preference[:, number].view(batch, level.rows, level.size, width)
+            bias, features, values = level.wide
+            to_bias, to_features, to_values = (torch.zeros_like(plane) for plane in level.wide)
+            for _, _, rows, cols in level.taps():
+                weight = weights[tap].view(batch, level.rows, level.size, width)
+                inner = -base
+                for k in range(values.shape[1]):
+                    inner.addcmul_(pull[:, k], values[:, k, rows, None, cols])
+                    to_values[:, k, rows, cols] += (weight * pull[:, k]).sum(2)
+                inner *= weight  # d loss / d logit
+                wish += inner
+                to_bias[:, rows, cols] += inner.sum(2)
+                for k in range(features.shape[1]):
+                    back[:, k].addcmul_(inner, features[:, k, rows, None, cols], value=2.0)
+                    to_features[:, k, rows, cols] += (inner * aim[:, k]).sum(2).mul_(2.0)
+                tap += 1
+            grad_cells += [level.narrow(to_bias), level.narrow(to_features), level.narrow(to_values)]
+        return grad_target, grad_preference, None, None, *grad_cells
+
+
+def _levels(sizes: Sequence[int], windows: Sequence[int], cells: Sequence[Tensor]) -> list[_Level]:
+    triples = zip(cells[0::3], cells[1::3], cells[2::3], strict=True)
+    return [_Level(s, w, *planes) for s, w, planes in zip(sizes, windows, triples, strict=True)]
+
+
+def affinity_filter(
+    features: Tensor,
+    source_bias: Tensor,
+    target_preference: Tensor,
+    log_n: Tensor,
+    values: Tensor,
+    windows: Sequence[int],
+) -> Tensor:
+    """Filters values over a pyramid with affinity kernels.
+
+    Parameters
+    ----------
+    features : (B, D, H, W), source_bias and target_preference : (B, levels, H, W)
+    log_n : (B, H, W) log occupancy of each source, -inf for none
+    values : (B, C, H, W) per unit of occupancy
+    windows : odd window size of each level, in cells of 2**level pixels
+
+    Returns
+    -------
+    (B, C, H, W) means over the reached sources; 0 where no source is in reach.
+    """
+    height, width = log_n.shape[-2:]
+    size = 2 ** (len(windows) - 1)
+    pad = (0, math.ceil(width / size) * size - width, 0, math.ceil(height / size) * size - height)
+    if any(pad):
+        features, values = F.pad(features, pad), F.pad(values, pad)
+        source_bias, target_preference = F.pad(source_bias, pad), F.pad(target_preference, pad)
+        log_n = F.pad(log_n, pad, value=-torch.inf)
+    cells: list[Tensor] = []
+    sizes = [2**number for number in range(len(windows))]
+    planes = torch.cat([features, values], 1)
+    for number, cell in enumerate(sizes):
+        biased = log_n + source_bias[:, number]
+        bias, means = pool_cells(biased, planes, cell)
+        feature, value = means.split([features.shape[1], values.shape[1]], 1)
+        cells += [bias - feature.square().sum(1), feature, value]
+    out: Tensor = _AffinityFilter.apply(features, target_preference, sizes, tuple(windows), *cells)
+    return out[..., :height, :width]

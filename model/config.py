@@ -1,0 +1,128 @@
+"""What a denoiser is made of, as data: every variant of the paper and every preset of ours is one `Config`.
+
+Published sizes are from Munkberg & Hasselgren, "Neural Denoising with Layer Embeddings", EGSR 2020.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+Variant = Literal["layer", "layer_a", "layer_w", "sample_splat", "pixel_gather"]
+Widths = tuple[tuple[int, ...], ...]
+
+ALL_ROLES = ("radiance", "depth", "normal", "albedo", "specular", "roughness", "motion", "coc", "lens", "time")
+MAX_LAYERS = 5
+
+
+@dataclass(frozen=True)
+class UNetConfig:
+    """A U-Net of 3x3 convolutions: one tuple of widths per block, finest first on the way down."""
+
+    encoder: Widths
+    bottleneck: tuple[int, ...]
+    decoder: Widths  # coarsest first; as many blocks as the encoder
+    head: tuple[int, ...] = ()  # further convolutions at the finest resolution
+    scale: int = 1  # the network works at 1/scale of the picture's resolution
+
+    @property
+    def out_channels(self) -> int:
+        """Channels of the context it returns."""
+        return self.head[-1] if self.head else self.decoder[-1][-1]
+
+    @property
+    def stride(self) -> int:
+        """Pictures are padded to a multiple of this many pixels."""
+        return int(self.scale * 2 ** len(self.encoder))
+
+
+@dataclass(frozen=True)
+class Config:
+    """One denoiser.
+
+    `kernel` "direct" predicts every tap's logit (the paper), "affinity" predicts features whose distances are the
+    logits. For "direct", `kernel_sizes` has one odd size per pyramid level; for "affinity", it is the window at each
+    level, in cells of 2**level pixels.
+    """
+
+    name: str
+    unet: UNetConfig
+    variant: Variant = "layer"
+    roles: tuple[str, ...] = ALL_ROLES
+    encoding: Literal["paper", "log"] = "log"
+    reducer: tuple[int, ...] = (32, 32, 32)  # widths of the sample reducer; the last is the embedding
+    partitioner: tuple[int, ...] = (32, 16)  # hidden widths; the logits follow
+    partition_logits: int = MAX_LAYERS  # logits predicted; `layers` of them are used
+    layers: int = 2  # layers when the caller does not say
+    statistics: bool = True  # context also sees the spread of embeddings, effective count, pixel statistics
+    depth_prior: bool = True  # partition logits start from depth relative to the neighbourhood
+    confidence: bool = True  # samples are weighted by (1 + exposure L)^-gamma, gamma predicted
+    kernel: Literal["direct", "affinity"] = "affinity"
+    kernel_sizes: tuple[int, ...] = (3, 3, 3, 3, 3, 3)
+    generator: tuple[int, ...] = (48, 48)  # hidden widths of the kernel generator
+    affinity_features: int = 8
+    demodulation: bool = True  # mix in a path whose kernels average radiance divided by albedo + specular
+
+    def __post_init__(self) -> None:
+        if len(self.unet.encoder) != len(self.unet.decoder):
+            raise ValueError("the U-Net needs as many decoder as encoder blocks")
+        if not 1 <= self.layers <= max(self.partition_logits, 1):
+            raise ValueError(f"{self.layers} layers with {self.partition_logits} partition logits")
+        if any(size % 2 == 0 for size in self.kernel_sizes):
+            raise ValueError(f"kernel sizes must be odd: {self.kernel_sizes}")
+
+    @property
+    def embedding(self) -> int:
+        """Width of a sample embedding."""
+        return self.reducer[-1]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, for a weight file's metadata."""
+        return dataclasses.asdict(self)
+
+    @staticmethod
+    def from_dict(data: dict[str, Any]) -> Config:
+        """The inverse of `to_dict`, also after a trip through JSON (lists become tuples)."""
+
+        def freeze(value: Any) -> Any:
+            return tuple(freeze(item) for item in value) if isinstance(value, (list, tuple)) else value
+
+        fields = {key: freeze(value) for key, value in data.items() if key != "unet"}
+        unet = UNetConfig(**{key: freeze(value) for key, value in data["unet"].items()})
+        return Config(unet=unet, **fields)
+
+
+PAPER_UNET = UNetConfig(
+    encoder=((64, 64), (128,), (256,), (512,), (512,)),
+    bottleneck=(512,),
+    decoder=((512, 512), (256, 256), (128, 128), (128, 128), (128, 128)),
+    head=(128,),
+)
+
+LAYER = Config(
+    name="layer",
+    unet=PAPER_UNET,
+    encoding="paper",
+    partition_logits=2,
+    statistics=False,
+    depth_prior=False,
+    confidence=False,
+    kernel="direct",
+    kernel_sizes=(17,),
+    generator=(128, 128),
+    demodulation=False,
+)
+
+FAST = Config(
+    name="fast",
+    unet=UNetConfig(
+        encoder=((48, 48), (64, 64), (96, 96), (128,)),
+        bottleneck=(128,),
+        decoder=((128, 128), (96, 96), (64, 64), (48, 48)),
+        scale=2,
+    ),
+    reducer=(32, 32, 24),
+    partitioner=(24, 16),
+    generator=(48, 48),
+)

@@ -1,0 +1,119 @@
+"""The two building blocks of every denoiser: a multilayer perceptron on rows and a U-Net on pictures.
+
+Leaky ReLU (slope 0.01) after every layer but an MLP's last, Xavier initialisation, no normalisation layers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from model.config import UNetConfig
+
+LEAK = 0.01
+
+
+def _xavier(module: nn.Linear | nn.Conv2d) -> None:
+    nn.init.xavier_uniform_(module.weight, nn.init.calculate_gain("leaky_relu", LEAK))
+    if module.bias is not None:
+        nn.init.zeros_(module.bias)
+
+
+class Mlp(nn.Module):
+    """Rows (N, inputs) -> (N, widths[-1]).
+
+    The first layer is split by input group, W [a; b] = W_a a + W_b b, so that a group that many rows share (the context
+    of a pixel's samples) is multiplied once per pixel: `first(group, x)` gives one group's part, `rest` finishes.
+    """
+
+    def __init__(self, groups: Sequence[int], widths: Sequence[int]) -> None:
+        super().__init__()
+        self.groups = nn.ModuleList(nn.Linear(size, widths[0], bias=k == 0) for k, size in enumerate(groups))
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True))
+        whole = nn.Linear(sum(groups), widths[0])  # Xavier sees the layer as one matrix
+        _xavier(whole)
+        with torch.no_grad():
+            for linear, block in zip(self.groups, whole.weight.split(list(groups), 1), strict=True):
+                assert isinstance(linear, nn.Linear)
+                linear.weight.copy_(block)
+                if linear.bias is not None:
+                    linear.bias.zero_()
+        for layer in self.layers:
+            assert isinstance(layer, nn.Linear)
+            _xavier(layer)
+
+    def first(self, group: int, x: Tensor) -> Tensor:
+        """One group's part of the first layer: (N, groups[group]) -> (N, widths[0]), before the activation."""
+        part: Tensor = self.groups[group](x)
+        return part
+
+    def rest(self, x: Tensor, activate_last: bool = False) -> Tensor:
+        """From the sum of the first layer's parts to the output."""
+        for layer in self.layers:
+            x = layer(F.leaky_relu(x, LEAK))
+        return F.leaky_relu(x, LEAK) if activate_last else x
+
+
+class _Block(nn.Module):
+    def __init__(self, inputs: int, widths: Sequence[int]) -> None:
+        super().__init__()
+        sizes = [inputs, *widths]
+        self.convolutions = nn.ModuleList(
+            nn.Conv2d(a, b, 3, padding=1) for a, b in zip(sizes[:-1], sizes[1:], strict=True)
+        )
+        for convolution in self.convolutions:
+            assert isinstance(convolution, nn.Conv2d)
+            _xavier(convolution)
+
+    def forward(self, x: Tensor) -> Tensor:
+        for convolution in self.convolutions:
+            x = F.leaky_relu(convolution(x), LEAK)
+        return x
+
+
+class UNet(nn.Module):
+    """Pictures (B, inputs, H, W) -> context (B, out_channels, H, W), H and W multiples of `config.stride`.
+
+    Each encoder block ends in a 2x2 max-pool; skips are the pooled outputs and the raw input, as published.
+    """
+
+    def __init__(self, inputs: int, config: UNetConfig) -> None:
+        super().__init__()
+        self.config = config
+        skips = [inputs, *(widths[-1] for widths in config.encoder[:-1])]
+        sizes = [inputs, *(widths[-1] for widths in config.encoder)]
+        self.encoder = nn.ModuleList(_Block(a, widths) for a, widths in zip(sizes, config.encoder, strict=False))
+        self.bottleneck = _Block(sizes[-1], config.bottleneck)
+        self.decoder = nn.ModuleList()
+        below = config.bottleneck[-1]
+        for skip, widths in zip(reversed(skips), config.decoder, strict=True):
+            self.decoder.append(_Block(below + skip, widths))
+            below = widths[-1]
+        self.head = _Block(below, config.head)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.levels(x)[-1]
+
+    def levels(self, x: Tensor) -> list[Tensor]:
+        """The decoder's outputs, coarsest first; the last one has been through the head and has the input's size."""
+        full = x.shape[-2:]
+        if self.config.scale > 1:
+            x = F.avg_pool2d(x, self.config.scale)
+        skips = []
+        for block in self.encoder:
+            skips.append(x)
+            x = F.max_pool2d(block(x), 2)
+        x = self.bottleneck(x)
+        outputs = []
+        for block, skip in zip(self.decoder, reversed(skips), strict=True):
+            x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
+            x = block(torch.cat([x, skip], 1))
+            outputs.append(x)
+        x = self.head(x)
+        if self.config.scale > 1:
+            x = F.interpolate(x, size=full, mode="bilinear", align_corners=False)
+        outputs[-1] = x
+        return outputs

@@ -1,0 +1,108 @@
+"""Samples -> layers: the depth prior, the partition of each sample over layers, and the splat of samples to layers.
+
+The splat is exact in the log domain: a sample of weight 1e-30 counts as 1e-30, and no epsilon enters a denominator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from model.config import MAX_LAYERS
+from model.features import FrameScale, log_depth
+from model.samples import Samples, Segments
+
+PRIOR_WINDOW = 9  # pixels; the neighbourhood that depth is compared with
+PRIOR_SPREAD = 0.1  # log units: depth differences well under this are one surface
+PRIOR_LIMIT = 4.0  # standard deviations
+
+
+def kept_logits(layers: int, logits: int) -> list[int]:
+    """Which of `logits` partition logits make `layers` layers: the first ones and the last (the background)."""
+    if not 1 <= layers <= logits:
+        raise ValueError(f"{layers} layers asked of a network that has up to {logits}")
+    return [*range(layers - 1), logits - 1]
+
+
+def layer_positions(logits: int, device: torch.device) -> Tensor:
+    """(logits,) positions of the layers in depth, -1 (front) to 1 (back)."""
+    return torch.linspace(-1.0, 1.0, logits, device=device) if logits > 1 else torch.ones(1, device=device)
+
+
+def relative_depth(samples: Samples, segments: Segments, scale: FrameScale) -> Tensor:
+    """(N, 1): log depth against its neighbourhood, in spreads, - in front, + behind, +-PRIOR_LIMIT.
+
+    (log z - mean) / (spread + PRIOR_SPREAD), mean and spread weighted over PRIOR_WINDOW pixels around the sample's
+    pixel. A miss is PRIOR_LIMIT behind wherever the neighbourhood has hits, and 0 where it has none.
+    """
+    batch, height, width = samples.shape
+    hit = (samples.coverage > 0)[:, None]
+    depth = torch.where(hit, samples.roles["depth"], scale.depth)
+    zeta = log_depth(depth, scale.depth)
+    weight = samples.weight[:, None] * hit
+    moments = segments.sum(torch.cat([weight, weight * zeta, weight * zeta * zeta], 1))  # (P, 3)
+    picture = moments.view(batch, height, width, 3).permute(0, 3, 1, 2)
+    blurred = F.avg_pool2d(picture, PRIOR_WINDOW, 1, PRIOR_WINDOW // 2)
+    total, first, second = blurred.permute(0, 2, 3, 1).reshape(-1, 3).split(1, 1)
+    some = total > 0
+    safe = torch.where(some, total, 1)
+    mean = first / safe
+    spread = (second / safe - mean * mean).clamp_min(0).sqrt()
+    around = segments.expand(torch.cat([mean, spread, some.to(mean.dtype)], 1))
+    relative = ((zeta - around[:, :1]) / (around[:, 1:2] + PRIOR_SPREAD)).clamp(-PRIOR_LIMIT, PRIOR_LIMIT)
+    return torch.where(hit, relative, PRIOR_LIMIT) * around[:, 2:]
+
+
+@dataclass
+class LayerSplat:
+    """What the samples of each pixel put into each layer, (P, L) and (P, L, C), per unit of occupancy.
+
+    log_n : log of the occupancy n_l = sum_{k>=l} w_k, -inf where nothing is in this layer or behind it
+    log_w : log of the layer's own weight w_l
+    values : sum_i w_i p_il value_i / n_l, 0 where n_l is 0
+    """
+
+    log_n: Tensor
+    log_w: Tensor
+    values: Tensor
+
+
+def splat(log_weight: Tensor, log_partition: Tensor, values: Tensor, segments: Segments) -> LayerSplat:
+    """Splats samples to the layers of their pixel.
+
+    Parameters
+    ----------
+    log_weight : (N, 1) log of the samples' weights, confidence included; -inf is allowed
+    log_partition : (N, L) log of the partition, rows sum to 1 in the linear domain
+    values : (N, C) per sample
+    """
+    behind = torch.logcumsumexp(log_partition.flip(1), 1).flip(1)  # (N, L): log sum_{k>=l} p_k
+    log_occupancy = log_weight + behind
+    peak = segments.max(log_occupancy)  # (P, L)
+    empty = peak == -torch.inf
+    peak = torch.where(empty, 0, peak)
+    at_samples = segments.expand(peak)
+    occupancy = segments.sum(torch.exp(log_occupancy - at_samples))  # >= 1 unless empty
+    own = torch.exp(log_weight + log_partition - at_samples)  # (N, L) <= 1
+    sums = segments.weighted_sum(own, torch.cat([values, torch.ones_like(log_weight)], 1))  # (P, L, C+1)
+    safe = torch.where(empty, 1, occupancy)
+    weight = sums[..., -1]
+    tiny = torch.finfo(weight.dtype).tiny
+    log_w = torch.where(weight > 0, torch.log(weight.clamp_min(tiny)) + peak, -torch.inf)
+    return LayerSplat(
+        log_n=torch.where(empty, -torch.inf, torch.log(safe) + peak),
+        log_w=log_w,
+        values=sums[..., :-1] / safe[..., None],
+    )
+
+
+def initial_logits(relative: Tensor | None, strength: Tensor, keep: Sequence[int]) -> Tensor | float:
+    """What the depth prior adds to the kept partition logits: front samples towards front layers."""
+    if relative is None:
+        return 0.0
+    positions = layer_positions(MAX_LAYERS, relative.device)[list(keep)]
+    return strength * relative * positions

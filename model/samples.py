@@ -1,0 +1,129 @@
+"""The network's input: path samples of a batch of images, flat, pixel after pixel (CSR).
+
+`Segments` holds the reductions over the samples of each pixel. Nothing here knows what a feature means.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+ROLE_WIDTHS: Mapping[str, int] = {
+    "radiance": 3,
+    "coverage": 1,
+    "depth": 1,
+    "normal": 3,
+    "albedo": 3,
+    "specular": 3,
+    "roughness": 1,
+    "motion": 2,
+    "coc": 1,
+    "lens": 2,
+    "time": 1,
+}
+
+
+class Segments:
+    """Which samples belong to which pixel, and sums, maxima and gathers over them.
+
+    Parameters
+    ----------
+    counts : (P,) integer tensor, samples of each pixel, any of them may be 0.
+
+    When every pixel holds the same number of samples the reductions are reshapes; otherwise they go by index.
+    """
+
+    def __init__(self, counts: Tensor) -> None:
+        self.counts = counts
+        self.pixels = counts.numel()
+        low, high = (int(counts.min()), int(counts.max())) if self.pixels else (0, 0)
+        self.uniform: int | None = high if low == high and high > 0 else None
+        self.total = self.pixels * high if self.uniform else int(counts.sum())
+        self._index: Tensor | None = None
+
+    @property
+    def index(self) -> Tensor:
+        """(N,) int64: the pixel of each sample."""
+        if self._index is None:
+            pixels = torch.arange(self.pixels, device=self.counts.device)
+            self._index = torch.repeat_interleave(pixels, self.counts.long(), output_size=self.total)
+        return self._index
+
+    def expand(self, per_pixel: Tensor) -> Tensor:
+        """(P, ...) -> (N, ...): each sample gets its pixel's value."""
+        if self.uniform is not None:
+            shape = (self.pixels, self.uniform, *per_pixel.shape[1:])
+            return per_pixel.unsqueeze(1).expand(shape).reshape(self.total, *per_pixel.shape[1:])
+        return per_pixel[self.index]
+
+    def sum(self, per_sample: Tensor) -> Tensor:
+        """(N, C) -> (P, C): sums over each pixel's samples, 0 for a pixel without any."""
+        if self.uniform is not None:
+            return per_sample.view(self.pixels, self.uniform, -1).sum(1)
+        out = per_sample.new_zeros(self.pixels, per_sample.shape[1])
+        return out.index_add(0, self.index, per_sample)
+
+    def weighted_sum(self, weight: Tensor, per_sample: Tensor) -> Tensor:
+        """weight (N, L), per_sample (N, C) -> (P, L, C): sum_i weight_il * value_ic."""
+        if self.uniform is not None:
+            left = weight.view(self.pixels, self.uniform, -1).transpose(1, 2)  # (P, L, n)
+            return torch.bmm(left, per_sample.view(self.pixels, self.uniform, -1))
+        columns = [self.sum(weight[:, k : k + 1] * per_sample) for k in range(weight.shape[1])]
+        return torch.stack(columns, 1)
+
+    def max(self, per_sample: Tensor) -> Tensor:
+        """(N, C) -> (P, C): maxima over each pixel's samples, -inf for a pixel without any. Not differentiated."""
+        values = per_sample.detach()
+        if self.uniform is not None:
+            return values.view(self.pixels, self.uniform, -1).amax(1)
+        out = values.new_full((self.pixels, values.shape[1]), -torch.inf)
+        index = self.index[:, None].expand_as(values)
+        return out.scatter_reduce(0, index, values, "amax")
+
+
+@dataclass
+class Samples:
+    """Path samples of a batch of B images of H x W pixels, in pixel order (image, row, column).
+
+    Attributes
+    ----------
+    shape : (B, H, W)
+    counts : (B*H*W,) integer; samples of each pixel
+    weight : (N,) >= 0, sums to 1 over each pixel that has samples
+    coverage : (N,) 0..1; features of a sample with coverage 0 (a miss) are never read
+    roles : role -> (N, width) float32, see ROLE_WIDTHS; "radiance" always, linear, any scale
+    """
+
+    shape: tuple[int, int, int]
+    counts: Tensor
+    weight: Tensor
+    coverage: Tensor
+    roles: dict[str, Tensor]
+
+    def __post_init__(self) -> None:
+        batch, height, width = self.shape
+        if self.counts.numel() != batch * height * width:
+            raise ValueError(f"{self.counts.numel()} counts for {batch}x{height}x{width} pixels")
+        if "radiance" not in self.roles:
+            raise ValueError("the radiance role is required")
+        for role, values in self.roles.items():
+            if role not in ROLE_WIDTHS:
+                raise ValueError(f"unknown role {role!r}; known: {', '.join(ROLE_WIDTHS)}")
+            if values.shape != (self.weight.numel(), ROLE_WIDTHS[role]):
+                raise ValueError(f"role {role}: shape {tuple(values.shape)}, expected ({self.weight.numel()}, "
+                                 f"{ROLE_WIDTHS[role]})")
+
+    def pixel_range(self, first: int, last: int) -> Samples:
+        """The samples of pixels first..last (exclusive), as one image row."""
+        start = int(self.counts[:first].sum())
+        stop = start + int(self.counts[first:last].sum())
+        return Samples(
+            (1, 1, last - first),
+            self.counts[first:last],
+            self.weight[start:stop],
+            self.coverage[start:stop],
+            {role: values[start:stop] for role, values in self.roles.items()},
+        )
