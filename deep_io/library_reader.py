@@ -1,0 +1,90 @@
+"""Deep parts that deep_reader.py does not decode itself (tiled, or ZSTD), read whole through the OpenEXR library.
+
+The library makes a Python object per pixel and channel: many times the memory of the samples and ten times the time
+of the flat path. A MemoryCostWarning says so before it begins.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Sequence
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deep_io.chunks import chunk_count
+from deep_io.errors import InputError, MemoryCostWarning
+from deep_io.header import FileHeaders
+
+# What the library holds per pixel and channel besides the values: a NumPy array object and its reference, measured.
+_OBJECT_BYTES = 250
+# A chunk's leader: at least y, and three sizes of 8 bytes.
+_LEAST_CHUNK_BYTES = 8 + 28
+# Each pixel takes 4 bytes of count table, which ZSTD packs at most about so many times.
+_ZSTD_RATIO = 32768
+
+
+class LibraryRows:
+    """All rows of a deep part, read by the library when it is opened; the counterpart of deep_reader._ScanlineRows.
+
+    Raises InputError for a part the file cannot hold or the library cannot read.
+    """
+
+    def __init__(self, file: BinaryIO, headers: FileHeaders, part: int, path: str) -> None:
+        header = headers.parts[part]
+        window = header.data_window
+        where = f"{path}: part {part}" if headers.multipart else path
+        size = os.fstat(file.fileno()).st_size
+        chunks = sum(chunk_count(each, where) for each in headers.parts)
+        pixels = window.width * window.height
+        if headers.end + chunks * _LEAST_CHUNK_BYTES > size or 4 * pixels > size * _ZSTD_RATIO:
+            raise InputError(f"{where}: the header promises {window.width} x {window.height} pixels in {chunks} chunks, "
+                             f"more than the file's {size} bytes can hold: truncated or corrupt")
+        estimate = pixels * len(header.channels) * _OBJECT_BYTES
+        kind = "tiled" if header.type == "deeptile" else "ZSTD"
+        warnings.warn(f"{where}: {kind} deep data is read through the OpenEXR library, the whole frame at once: slow, and "
+                      f"about {estimate / 2**30:.1f} GiB of memory besides the samples", MemoryCostWarning, stacklevel=4)
+        arrays = _read(path, part, where)
+        if sorted(arrays) != sorted(header.channel_names):
+            raise InputError(f"{where}: the OpenEXR library cannot read its pixels (corrupt?)")
+        self._counts: NDArray[np.int32] | None = None
+        self._values: list[NDArray[np.generic]] = []
+        for channel in header.channels:
+            objects = arrays.pop(channel.name)
+            if objects.shape != (window.height, window.width):
+                raise InputError(f"{where}: the OpenEXR library read {objects.shape} pixels of channel {channel.name}")
+            counts = np.array([0 if pixel is None else len(pixel) for pixel in objects.ravel()], np.int32)
+            if self._counts is None:
+                self._counts = counts.reshape(objects.shape)
+            elif not np.array_equal(self._counts.ravel(), counts):
+                raise InputError(f"{where}: channel {channel.name} has other sample counts than the first channel")
+            held = [pixel for pixel in objects.ravel() if pixel is not None and len(pixel)]
+            self._values.append(np.concatenate(held).astype(channel.dtype, copy=False) if held
+                                else np.empty(0, channel.dtype))
+        assert self._counts is not None  # A part has at least one channel.
+        self.samples = self._counts.sum(axis=1, dtype=np.int64)
+        self._starts = np.concatenate(([0], np.cumsum(self.samples))).tolist()
+
+    def decode(self, row: int, counts: NDArray[np.int32], channels: Sequence[tuple[int, NDArray[np.generic]]]) -> None:
+        """Copy a row out; see deep_reader._Rows."""
+        assert self._counts is not None
+        counts[:] = self._counts[row]
+        for index, values in channels:
+            values[:] = self._values[index][self._starts[row]:self._starts[row + 1]]
+
+    def close(self) -> None:
+        """Release the frame."""
+        self._counts, self._values = None, []
+
+
+def _read(path: str, part: int, where: str) -> dict[str, NDArray[Any]]:
+    """Channel name -> (H, W) object array of one array per pixel. Raises InputError."""
+    import OpenEXR  # 70 ms of start-up that flat files and the scanline path do not need.
+
+    try:
+        parts = OpenEXR.File(path, separate_channels=True).parts
+        return {name: channel.pixels for name, channel in parts[part].channels.items()}
+    except Exception as error:  # The library raises RuntimeError and others of its own; corrupt files leave no parts.
+        raise InputError(f"{where}: the OpenEXR library cannot read it: {' '.join(str(error).split())}") from error
