@@ -118,7 +118,10 @@ def relmse_trimmed(d: Float64, r: Float64, share: float = TRIMMED_SHARE) -> floa
 
 
 def relmse_unbiased(d: Float64, a: Float64, b: Float64) -> float:
-    """mean((d - a)(d - b) / (r^2 + 0.01)), r = (a + b) / 2: the noise of independent a and b cancels on average."""
+    """mean((d - a)(d - b) / (r^2 + 0.01)), r = (a + b) / 2: the noise of independent a and b cancels on average.
+
+    Only r in the denominator keeps some of it, which matters where the reference itself is very noisy.
+    """
     return float(((d - a) * (d - b) / (((a + b) / 2.0) ** 2 + EPSILON)).mean())
 
 
