@@ -117,9 +117,9 @@ LAYER = Config(
 FAST = Config(
     name="fast",
     unet=UNetConfig(
-        encoder=((48, 48), (64, 64), (96, 96), (128,)),
-        bottleneck=(128,),
-        decoder=((128, 128), (96, 96), (64, 64), (48, 48)),
+        encoder=((64, 64), (96, 96), (128, 128), (160,)),
+        bottleneck=(160,),
+        decoder=((160, 160), (128, 128), (96, 96), (64, 64)),
         scale=2,
     ),
     reducer=(32, 32, 24),

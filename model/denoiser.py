@@ -16,7 +16,7 @@ from model.affinity import affinity_filter
 from model.compositing import Layers, fill_holes, transmittance
 from model.config import Config
 from model.features import FrameScale, divisor, encode, feature_groups, log_depth, log_radiance
-from model.networks import Mlp, UNet
+from model.networks import Mlp, Products, UNet
 from model.partition import initial_logits, kept_logits, relative_depth, splat
 from model.samples import Samples, Segments
 
@@ -56,7 +56,9 @@ class SampleReducer(nn.Module):
         weight = first.weight if len(columns) == first.in_features else first.weight[:, columns]
         bias = first.bias + self.presence[present].sum(0)
         x = torch.cat([features[name] for name in self.groups if name in features], 1)
-        return self.mlp.rest(F.linear(x, weight, bias), activate_last=True)
+        with self.mlp.products(x):
+            hidden = F.linear(x, weight, bias)
+        return self.mlp.rest(hidden, activate_last=True)
 
 
 class Denoiser(nn.Module):
@@ -104,6 +106,13 @@ class Denoiser(nn.Module):
                 assert isinstance(last, nn.Linear)
                 last.bias[-1] = CONFIDENCE_START
 
+    def set_product_dtype(self, dtype: torch.dtype | None) -> Denoiser:
+        """Lets matrix products and convolutions run in bfloat16 or float16; everything else stays in float32."""
+        for module in self.modules():
+            if isinstance(module, Products):
+                module.product_dtype = dtype
+        return self
+
     def _context_inputs(self) -> int:
         embedding = self.config.embedding
         return 2 * embedding + PIXEL_STATISTICS if self.config.statistics else embedding
@@ -140,10 +149,12 @@ class Denoiser(nn.Module):
         relative = None
         if self.config.depth_prior and "depth" in samples.roles:
             relative = relative_depth(samples, segments, scale)
-        context = self._context(samples, relative, scale)
+        context, embedding = self._context(samples, relative, scale)
         parts = []
         for part, rows, part_relative in self._chunks(samples, relative):
-            planes = self._splat(part, part_relative, context[rows], scale, keep)  # (p, L, K)
+            if len(part.weight) < len(samples.weight):  # of several chunks: cheaper to repeat than to keep
+                embedding = self.reducer(part, scale)
+            planes = self._splat(part, embedding, part_relative, context[rows], scale, keep)  # (p, L, K)
             parts.append((planes, self._predict(planes, context[rows], keep)))
         batch, height, width = samples.shape
 
@@ -181,20 +192,23 @@ class Denoiser(nn.Module):
             yield part, slice(first, last), None if relative is None else relative[start:stop]
             first, start = last, stop
 
-    def _context(self, samples: Samples, relative: Tensor | None, scale: FrameScale) -> Tensor:
-        """(P, C) rows of context."""
-        rows = [self._context_rows(part, rel, scale) for part, _, rel in self._chunks(samples, relative)]
+    def _context(self, samples: Samples, relative: Tensor | None, scale: FrameScale) -> tuple[Tensor, Tensor]:
+        """(P, C) rows of context, and the embeddings (n, E) of the last chunk."""
+        rows = []
+        for part, _, part_relative in self._chunks(samples, relative):
+            embedding = self.reducer(part, scale)
+            rows.append(self._context_rows(part, embedding, part_relative, scale))
         batch, height, width = samples.shape
         picture = torch.cat(rows, 0).view(batch, height, width, -1).permute(0, 3, 1, 2)  # channels last in memory
         stride = self.config.unet.stride
         padded = F.pad(picture, (0, -width % stride, 0, -height % stride))
         context: Tensor = self.unet(padded)[..., :height, :width]
-        return context.permute(0, 2, 3, 1).reshape(batch * height * width, -1).to(picture.dtype)
+        return context.permute(0, 2, 3, 1).reshape(batch * height * width, -1).to(picture.dtype), embedding
 
-    def _context_rows(self, samples: Samples, relative: Tensor | None, scale: FrameScale) -> Tensor:
+    def _context_rows(self, samples: Samples, embedding: Tensor, relative: Tensor | None, scale: FrameScale) -> Tensor:
         segments = Segments(samples.counts)
         weight = samples.weight[:, None]
-        embedding = self.reducer(samples, scale).to(weight.dtype)
+        embedding = embedding.to(weight.dtype)
         if not self.config.statistics:
             return segments.sum(weight * embedding)
         radiance = samples.roles["radiance"]
@@ -219,11 +233,10 @@ class Denoiser(nn.Module):
             1,
         )
 
-    def _splat(self, samples: Samples, relative: Tensor | None, context: Tensor, scale: FrameScale,
+    def _splat(self, samples: Samples, embedding: Tensor, relative: Tensor | None, context: Tensor, scale: FrameScale,
                keep: list[int]) -> Tensor:
         """(P, L, K) rows: log n, log w, then per unit of occupancy what SPLAT_VALUES and its neighbours name."""
         segments = Segments(samples.counts)
-        embedding = self.reducer(samples, scale)
         offset = relative if relative is not None else torch.zeros_like(samples.weight[:, None])
         shared = segments.expand(self.partitioner.first(0, context))
         mine = self.partitioner.first(1, torch.cat([embedding, offset.to(embedding.dtype)], 1))

@@ -16,13 +16,24 @@ from model.config import UNetConfig
 LEAK = 0.01
 
 
+class Products(nn.Module):
+    """A module whose matrix products may run in a lower precision than float32; its outputs keep that type."""
+
+    product_dtype: torch.dtype | None = None  # None: the type of the inputs
+
+    def products(self, like: Tensor) -> torch.autocast:
+        """The context that every product of this module runs in."""
+        low = self.product_dtype
+        return torch.autocast(like.device.type, dtype=low or torch.bfloat16, enabled=low is not None)
+
+
 def _xavier(module: nn.Linear | nn.Conv2d) -> None:
     nn.init.xavier_uniform_(module.weight, nn.init.calculate_gain("leaky_relu", LEAK))
     if module.bias is not None:
         nn.init.zeros_(module.bias)
 
 
-class Mlp(nn.Module):
+class Mlp(Products):
     """Rows (N, inputs) -> (N, widths[-1]).
 
     The first layer is split by input group, W [a; b] = W_a a + W_b b, so that a group that many rows share (the context
@@ -47,13 +58,15 @@ class Mlp(nn.Module):
 
     def first(self, group: int, x: Tensor) -> Tensor:
         """One group's part of the first layer: (N, groups[group]) -> (N, widths[0]), before the activation."""
-        part: Tensor = self.groups[group](x)
+        with self.products(x):
+            part: Tensor = self.groups[group](x)
         return part
 
     def rest(self, x: Tensor, activate_last: bool = False) -> Tensor:
         """From the sum of the first layer's parts to the output."""
-        for layer in self.layers:
-            x = layer(F.leaky_relu(x, LEAK))
+        with self.products(x):
+            for layer in self.layers:
+                x = layer(F.leaky_relu(x, LEAK))
         return F.leaky_relu(x, LEAK) if activate_last else x
 
 
@@ -74,7 +87,7 @@ class _Block(nn.Module):
         return x
 
 
-class UNet(nn.Module):
+class UNet(Products):
     """Pictures (B, inputs, H, W) -> context (B, out_channels, H, W), H and W multiples of `config.stride`.
 
     Each encoder block ends in a 2x2 max-pool; skips are the pooled outputs and the raw input, as published.
@@ -99,6 +112,10 @@ class UNet(nn.Module):
 
     def levels(self, x: Tensor) -> list[Tensor]:
         """The decoder's outputs, coarsest first; the last one has been through the head and has the input's size."""
+        with self.products(x):
+            return self._levels(x)
+
+    def _levels(self, x: Tensor) -> list[Tensor]:
         full = x.shape[-2:]
         if self.config.scale > 1:
             x = F.avg_pool2d(x, self.config.scale)

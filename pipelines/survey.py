@@ -18,10 +18,11 @@ def exposure_of(radiance: npt.NDArray[np.float32]) -> float:
     height, width = luminance.shape
     rows, cols = np.arange(0, height, EXPOSURE_BIN), np.arange(0, width, EXPOSURE_BIN)
     sums = np.add.reduceat(np.add.reduceat(luminance, rows, 0), cols, 1)
-    return exposure_of_bins(sums)
+    areas = np.diff([*rows, height])[:, None] * np.diff([*cols, width])[None, :]
+    return exposure_of_bins(sums / areas)
 
 
-def exposure_of_bins(sums: npt.NDArray[np.float64]) -> float:
-    """Exposure from bin sums of luminance; a bin's size in pixels is a factor of two's power away at most."""
-    positive = sums[sums > 0] / EXPOSURE_BIN**2
+def exposure_of_bins(means: npt.NDArray[np.float64]) -> float:
+    """Exposure from the bins' mean radiance."""
+    positive = means[means > 0]
     return float(2.0 ** -np.median(np.log2(positive))) if positive.size else 1.0
