@@ -6,9 +6,18 @@ from typing import Any
 
 import click
 
-from lbmc_cli.options import PROGRESS, ByteSize, Device, LbmcCommand, option, reading_options
+from lbmc_cli.options import (
+    PROGRESS,
+    ByteSize,
+    Device,
+    LbmcCommand,
+    build_options,
+    option,
+    part_choice,
+    reading_options,
+)
 from lbmc_cli.report import end_job, existing_choice
-from pipelines.options import ALL_LAYERS, COMPRESSIONS
+from pipelines.options import ALL_LAYERS, COMPRESSIONS, DenoiseOptions
 
 
 def _layers(ctx: click.Context, parameter: click.Parameter, value: str) -> int | None:
@@ -91,12 +100,12 @@ def denoise(overwrite: bool, skip_existing: bool, part: str | None, **choices: A
     IN and OUT may be sequences: shot.####.exr, shot.%04d.exr, shot.$F4.exr. Exit codes: 0 done, 1 some frames failed,
     2 usage or refused output, 3 IN unreadable or unsuitable.
     """
-    from pipelines.denoise import denoise_frames
-    from pipelines.options import DenoiseOptions
-
-    options = DenoiseOptions(
+    options = build_options(
+        DenoiseOptions,
         existing=existing_choice(overwrite, skip_existing),
-        part=int(part) if part is not None and part.isdigit() else part,
+        part=part_choice(part),
         **choices,
     )
+    from pipelines.denoise import denoise_frames
+
     return end_job(denoise_frames(options))

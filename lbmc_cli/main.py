@@ -47,6 +47,7 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
+        refuse_shadowed_packages()
         name = cmd_name.replace("-", "_")
         command: click.Command = getattr(import_module(f"lbmc_cli.{name}"), name)
         return command
@@ -78,7 +79,6 @@ def lbmc(debug: bool) -> None:
     Every option can also be given as an environment variable: LBMC_THREADS for --threads of every command,
     LBMC_DENOISE_THREADS for that of denoise alone.
     """
-    refuse_shadowed_packages()
 
 
 def refuse_shadowed_packages() -> None:
@@ -90,13 +90,14 @@ def refuse_shadowed_packages() -> None:
     home = Path(__file__).resolve().parent.parent
     for package in ("deep_io", "model", "pipelines"):
         spec = find_spec(package)
-        found = Path(spec.origin).resolve().parent if spec is not None and spec.origin else None
-        if found is None and spec is not None and spec.submodule_search_locations:
-            found = Path(next(iter(spec.submodule_search_locations))).resolve()
-        if found != home / package:
-            where = f"another one, {found}, comes first" if found else "it is missing"
-            cure = "take that folder off PYTHONPATH" if found else "install lbmc again"
-            raise click.ClickException(f"lbmc needs its own package {package!r} of {home}, but {where}; {cure}")
+        if spec is None:
+            raise click.ClickException(f"lbmc's own package {package!r} is missing from {home}; install lbmc again")
+        found = spec.origin or next(iter(spec.submodule_search_locations or ()), "")
+        if not Path(found).resolve().is_relative_to(home / package):
+            raise click.ClickException(
+                f"lbmc needs its own package {package!r} of {home}, but another one, {found}, comes first; "
+                "take its folder off PYTHONPATH, or run lbmc from another folder"
+            )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import click
+
+Options = TypeVar("Options")
 
 _UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
@@ -49,8 +52,6 @@ class LbmcOption(click.Option):
 
 
 def _environment(name: str) -> str | None:
-    import os
-
     return os.environ.get(name) or None
 
 
@@ -96,6 +97,19 @@ def role_overrides(ctx: click.Context, parameter: click.Parameter, values: tuple
     return overrides
 
 
+def build_options(kind: Callable[..., Options], **choices: Any) -> Options:
+    """kind(**choices), a pipeline's options; a value that they refuse becomes a usage error."""
+    try:
+        return kind(**choices)
+    except ValueError as error:
+        raise click.UsageError(str(error), click.get_current_context()) from error
+
+
+def part_choice(part: str | None) -> str | int | None:
+    """--part as the pipelines take it: digits are a number."""
+    return int(part) if part is not None and part.isdigit() else part
+
+
 def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """The options that say how a deep sample file is read; the same for every command that reads one."""
     for decorate in reversed(
@@ -109,7 +123,7 @@ def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
                 multiple=True,
                 metavar="ROLE=LAYER",
                 callback=role_overrides,
-                help="Layer or channel that plays a role, e.g. normal=N_world; an empty LAYER drops the role. Repeatable.",
+                help="Layer or channel that plays a role, e.g. normal=N_world; empty drops the role. Repeatable.",
             ),
             option(
                 "--weighting",

@@ -1,0 +1,126 @@
+"""What the commands share: environment variables, sizes, devices, role overrides, flags that exclude each other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from lbmc_cli.main import lbmc as program
+from lbmc_cli.options import ByteSize, Device
+from pipelines.options import DenoiseOptions
+from tests.runner import in_process
+
+
+@pytest.fixture
+def parsed(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Runs `lbmc denoise IN OUT ARGUMENTS` up to the pipeline's door and gives the options that would go in."""
+    caught: list[DenoiseOptions] = []
+
+    def parse(*arguments: str, env: dict[str, str] | None = None) -> DenoiseOptions:
+        import pipelines.denoise
+        from pipelines.jobs import JobReport
+
+        def catch(options: DenoiseOptions) -> JobReport[None]:
+            caught.append(options)
+            return JobReport(())
+
+        monkeypatch.setattr(pipelines.denoise, "denoise_frames", catch)
+        result = CliRunner().invoke(program, ["denoise", "in.exr", "out.exr", *arguments], env=env)
+        assert result.exit_code == 0, result.output
+        return caught[-1]
+
+    return parse
+
+
+def test_no_flags_are_the_dataclass_defaults(parsed: Any) -> None:
+    assert parsed() == DenoiseOptions("in.exr", "out.exr")
+
+
+def test_every_flag_reaches_its_option(parsed: Any) -> None:
+    words = (
+        "--frames 1-5 --skip-existing --force --part 1 --map normal=Nw --map depth=Zc --weighting over --normals world "
+        "--depth distance --camera cam.exr --model fast --layers 3 --no-adapt --exposure 2.5 --dry-run "
+        "--device cuda:1 --threads 3 --memory 1.5GiB --precision bf16 --pixel-type float --compression dwaa "
+        "--keep id --channels light_* --progress openjd"
+    )
+    assert parsed(*words.split()) == DenoiseOptions(
+        "in.exr",
+        "out.exr",
+        frames="1-5",
+        existing="skip",
+        force=True,
+        part=1,
+        overrides={"normal": "Nw", "depth": "Zc"},
+        weighting="over",
+        normals="world",
+        depth="distance",
+        camera="cam.exr",
+        model="fast",
+        layers=3,
+        adapt=False,
+        exposure=2.5,
+        dry_run=True,
+        device="cuda:1",
+        threads=3,
+        memory=3 << 29,
+        precision="bf16",
+        pixel_type="float",
+        compression="dwaa",
+        keep=("id", "light_*"),
+        progress="openjd",
+    )
+
+
+def test_a_part_may_be_named(parsed: Any) -> None:
+    assert parsed("--part", "beauty").part == "beauty"
+
+
+def test_environment_variables_stand_in_for_flags(parsed: Any) -> None:
+    assert parsed(env={"LBMC_THREADS": "2", "LBMC_DENOISE_DEVICE": "cpu"}).threads == 2
+    assert parsed(env={"LBMC_THREADS": "2", "LBMC_DENOISE_THREADS": "3"}).threads == 3
+    assert parsed("--threads", "4", env={"LBMC_DENOISE_THREADS": "3"}).threads == 4
+    assert parsed(env={"LBMC_OVERWRITE": "1"}).existing == "overwrite"
+    assert parsed(env={"LBMC_MAP": "normal=Nw depth=Zc"}).overrides == {"normal": "Nw", "depth": "Zc"}
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("2GiB", 2 << 30), ("512M", 512 << 20), ("1.5g", 3 << 29), ("100", 100), ("64 kib", 65536), ("1TB", 1 << 40)],
+)
+def test_sizes(text: str, size: int) -> None:
+    assert ByteSize().convert(text, None, None) == size
+
+
+@pytest.mark.parametrize("text", ["", "GiB", "-1G", "0", "2X", "1e9"])
+def test_what_is_not_a_size_is_refused(text: str) -> None:
+    with pytest.raises(click.BadParameter):
+        ByteSize().convert(text, None, None)
+
+
+@pytest.mark.parametrize("text", ["gpu", "cuda:", "cuda:x", "cpu:0", ""])
+def test_what_is_not_a_device_is_refused(text: str) -> None:
+    with pytest.raises(click.BadParameter):
+        Device().convert(text, None, None)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["--map", "normal"], "ROLE=LAYER"),
+        (["--map", "=N"], "ROLE=LAYER"),
+        (["--map", "normal=N", "--map", "normal=M"], "twice"),
+        (["--overwrite", "--skip-existing"], "exclude each other"),
+        (["--exposure", "1", "--exposure-from", "1001"], "exclude each other"),
+        (["--exposure", "0"], "exposure"),
+        (["--memory", "much"], "2GiB"),
+        (["--layers", "0"], "from 1 to 5"),
+    ],
+)
+def test_wrong_values_are_usage_errors_that_say_what_is_right(arguments: list[str], word: str) -> None:
+    run = in_process("denoise", "in.exr", "out.exr", *arguments)
+    assert run.code == 2
+    assert word in run.err
+    assert run.err.count("\n") == 1
