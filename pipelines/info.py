@@ -1,0 +1,217 @@
+"""What `lbmc info` shows: a file's headers, how its samples would be read, and statistics of every role.
+
+Streams the file by blocks of rows; nothing is written.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deep_io.header import Header, read_headers
+from deep_io.path_samples import PathSamples, SampleReader
+from pipelines.options import DepthKind, NormalSpace, WeightingName
+
+FIRST_HIT_ROLES = ("depth", "normal", "albedo", "specular", "roughness", "motion", "coc")
+"""Roles that a miss does not have: their statistics are over samples that hit something."""
+
+
+@dataclass
+class Range:
+    """Smallest, mean and largest of the values seen so far, each a list with one number per component."""
+
+    count: int = 0
+    low: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    total: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    high: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+
+    def add(self, values: NDArray[Any]) -> None:
+        """Takes in `values` (N, width)."""
+        if len(values) == 0:
+            return
+        low, high = values.min(0).astype(np.float64), values.max(0).astype(np.float64)
+        total = values.sum(0, dtype=np.float64)
+        if self.count:
+            low, high, total = np.minimum(self.low, low), np.maximum(self.high, high), self.total + total
+        self.count, self.low, self.total, self.high = self.count + len(values), low, total, high
+
+    def as_dict(self) -> dict[str, list[float]] | None:
+        """min, mean and max, or None when nothing was seen."""
+        if not self.count:
+            return None
+        return {"min": self.low.tolist(), "mean": (self.total / self.count).tolist(), "max": self.high.tolist()}
+
+
+@dataclass
+class SampleStatistics:
+    """Statistics of a part's samples, gathered block by block."""
+
+    pixels: int = 0
+    empty_pixels: int = 0
+    samples: int = 0
+    misses: int = 0
+    per_pixel: Range = field(default_factory=Range)
+    roles: dict[str, Range] = field(default_factory=dict)
+    repairs: Counter[str] = field(default_factory=Counter)
+
+    def add(self, block: PathSamples) -> None:
+        counts = block.counts.reshape(-1, 1)
+        self.pixels += counts.size
+        self.empty_pixels += int(np.count_nonzero(counts == 0))
+        self.samples += len(block.coverage)
+        self.per_pixel.add(counts)
+        hit = block.coverage > 0
+        self.misses += int(np.count_nonzero(~hit))
+        for role, values in {"coverage": block.coverage[:, None], **block.roles}.items():
+            self.roles.setdefault(role, Range()).add(values[hit] if role in FIRST_HIT_ROLES else values)
+        self.repairs.update(block.repairs)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers, for JSON."""
+        return {
+            "pixels": self.pixels,
+            "empty_pixels": self.empty_pixels,
+            "samples": self.samples,
+            "misses": self.misses,
+            "samples_per_pixel": self.per_pixel.as_dict(),
+            "roles": {role: values.as_dict() for role, values in self.roles.items()},
+            "repairs": dict(self.repairs),
+        }
+
+
+@dataclass(frozen=True)
+class FileInfo:
+    """All that is shown of one file."""
+
+    path: str
+    headers: tuple[Header, ...]
+    part: int
+    """The deep part that was read."""
+    mapping: tuple[str, ...]
+    """One line per role."""
+    sources: Mapping[str, tuple[str, ...]]
+    """Role to the channels it comes from."""
+    weighting: str
+    statistics: SampleStatistics
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return {
+            "path": self.path,
+            "parts": [header_as_dict(header) for header in self.headers],
+            "part": self.part,
+            "mapping": {role: list(channels) for role, channels in self.sources.items()},
+            "weighting": self.weighting,
+            **self.statistics.as_dict(),
+        }
+
+    def lines(self) -> list[str]:
+        """The same for a reader."""
+        text = [self.path]
+        for number, header in enumerate(self.headers):
+            mark = "*" if number == self.part else " "
+            text.append(f"{mark} part {number} {header.name!r}: {header.type}, {header.compression}")
+            text.append(f"    data window     {_window(header.data_window)}")
+            text.append(f"    display window  {_window(header.display_window)}, pixel aspect {header.pixel_aspect:g}")
+            text.append("    channels        " + " ".join(f"{c.name}:{c.dtype.name}" for c in header.channels))
+            text += [f"    {name:<15} {_short(stored.value)}" for name, stored in header.attributes.items()]
+        text += ["roles", *(f"  {line}" for line in self.mapping), f"weighting   {self.weighting}"]
+        statistics = self.statistics
+        text.append(f"pixels      {statistics.pixels}, {statistics.empty_pixels} without samples")
+        text.append(f"samples     {statistics.samples}, {statistics.misses} of them misses")
+        per_pixel = statistics.per_pixel.as_dict()
+        if per_pixel:
+            low, mean, high = (per_pixel[name][0] for name in ("min", "mean", "max"))
+            text.append(f"per pixel   min {low:.0f}  mean {mean:.2f}  max {high:.0f}")
+        text.append(f"{'role':<12}{'min':>32}{'mean':>32}{'max':>32}")
+        for role, values in statistics.roles.items():
+            shown = values.as_dict()
+            cells = [_numbers(shown[name]) for name in ("min", "mean", "max")] if shown else ["no hits"]
+            text.append(f"  {role:<10}" + "".join(f"{cell:>32}" for cell in cells))
+        if statistics.repairs:
+            text.append("repaired    " + ", ".join(f"{count} x {what}" for what, count in statistics.repairs.items()))
+        else:
+            text.append("repaired    nothing: every value is finite")
+        return text
+
+
+def file_info(
+    path: str | os.PathLike[str],
+    *,
+    part: str | int | None = None,
+    overrides: Mapping[str, str] | None = None,
+    weighting: WeightingName | None = None,
+    normals: NormalSpace = "auto",
+    depth: DepthKind = "z",
+    camera: str | None = None,
+) -> FileInfo:
+    """Reads all of one deep sample file, as a denoising job would, and says what is in it.
+
+    Raises InputError for what a denoising job would refuse, UsageError for options that do not fit the file.
+    """
+    headers = read_headers(path)
+    statistics = SampleStatistics()
+    with SampleReader(
+        path, part=part, overrides=overrides, weighting=weighting, normals=normals, depth=depth, camera=camera
+    ) as reader:
+        for block in reader.blocks():
+            statistics.add(block)
+        return FileInfo(
+            path=os.fspath(path),
+            headers=tuple(headers),
+            part=next(number for number, header in enumerate(headers) if header == reader.header),
+            mapping=tuple(reader.mapping.lines()),
+            sources={role: source.channels for role, source in reader.mapping.sources.items()},
+            weighting=reader.weighting,
+            statistics=statistics,
+        )
+
+
+def header_as_dict(header: Header) -> dict[str, Any]:
+    """A header in plain values; attributes of types that lbmc does not interpret are left as their type's name."""
+    return {
+        "name": header.name,
+        "type": header.type,
+        "compression": header.compression,
+        "line_order": header.line_order,
+        "pixel_aspect": header.pixel_aspect,
+        "data_window": list(_corners(header)[0]),
+        "display_window": list(_corners(header)[1]),
+        "channels": {channel.name: channel.dtype.name for channel in header.channels},
+        "attributes": {name: _plain(stored.value, stored.type) for name, stored in header.attributes.items()},
+    }
+
+
+def _corners(header: Header) -> tuple[tuple[int, int, int, int], tuple[int, int, int, int]]:
+    windows = (header.data_window, header.display_window)
+    data, display = ((w.xmin, w.ymin, w.xmax, w.ymax) for w in windows)
+    return data, display
+
+
+def _plain(value: Any, kind: str) -> Any:
+    if isinstance(value, bytes):
+        return f"<{kind}, {len(value)} bytes>"
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, (tuple, list)):
+        return [_plain(item, kind) for item in value]
+    return value if isinstance(value, (str, int, float, bool)) or value is None else str(value)
+
+
+def _window(window: Any) -> str:
+    return f"{window.width} x {window.height}, ({window.xmin}, {window.ymin}) to ({window.xmax}, {window.ymax})"
+
+
+def _short(value: Any, limit: int = 100) -> str:
+    text = " ".join(str(value).split())
+    return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def _numbers(values: list[float]) -> str:
+    return " ".join(f"{value:.4g}" for value in values)
