@@ -7,6 +7,7 @@ writer that was killed leaves zeros in it, and then the chunks are found by walk
 
 from __future__ import annotations
 
+import os
 import struct
 from dataclasses import dataclass
 from typing import BinaryIO
@@ -53,32 +54,63 @@ def chunk_count(header: Header, where: str) -> int:
     return count
 
 
-def read_row_table(file: BinaryIO, file_size: int, headers: FileHeaders, part: int, path: str) -> RowTable:
+def read_row_table(file: BinaryIO, headers: FileHeaders, part: int, path: str) -> RowTable:
     """Find and check every row of deep scanline part number `part`.
 
     Raises InputError, naming the file and where possible the row, when the part cannot hold what its header promises,
     a row is missing, doubled or out of the window, or a size does not fit the file.
     """
-    header = headers.parts[part]
-    where = f"{path}: part {part}" if headers.multipart else path
-    position = headers.end
-    for index in range(part):
-        position += 8 * chunk_count(headers.parts[index], f"{path}: part {index}")
-    window = header.data_window
-    leader = 4 * headers.multipart + 4 + _SIZES.size
-    rows = chunk_count(header, where)
-    # The table of a row holds 4 bytes per pixel, packed at best at the compression's largest ratio.
-    least = rows * (8 + leader + (4 * window.width - _RATIO_SLACK) // MAX_RATIO[header.compression])
-    if position + least > file_size:
-        raise InputError(f"{where}: the header promises {window.width} x {rows} pixels, more than the file's "
-                         f"{file_size} bytes can hold: truncated or corrupt")
-    file.seek(position)
-    offsets = np.frombuffer(file.read(8 * rows), "<i8")
-    if offsets.size != rows:
-        raise InputError(f"{where}: the chunk table is truncated")
+    file_size = os.fstat(file.fileno()).st_size
+    offsets = _read_chunk_table(file, file_size, headers, part, path)
     if (offsets <= 0).any():
         offsets = _walk(file, file_size, headers, part, path)
-    return _read_leaders(file, file_size, header, offsets, leader, where)
+    leader = 4 * headers.multipart + 4 + _SIZES.size
+    return _read_leaders(file, file_size, headers.parts[part], offsets, leader, part_label(headers, part, path))
+
+
+def check_chunks(file: BinaryIO, headers: FileHeaders, part: int, path: str) -> int:
+    """Check the chunk sizes of any deep part, also tiled and ZSTD, against the file; the bytes they unpack to.
+
+    Raises InputError when the part cannot hold what its header promises or a chunk does not fit the file.
+    """
+    file_size = os.fstat(file.fileno()).st_size
+    offsets = _read_chunk_table(file, file_size, headers, part, path)
+    header, where = headers.parts[part], part_label(headers, part, path)
+    before = 4 * headers.multipart + _COORDINATES[header.type]
+    total = 0
+    for chunk, offset in enumerate(offsets.tolist()):
+        if not 0 < offset <= file_size - before - _SIZES.size:
+            raise InputError(f"{where}: chunk {chunk} of {offsets.size} is missing (truncated or corrupt)")
+        file.seek(offset + before)
+        table_size, data_size, unpacked = _SIZES.unpack(file.read(_SIZES.size))
+        if table_size + data_size > file_size - offset - before - _SIZES.size:
+            raise InputError(f"{where}: chunk {chunk} runs past the end of the file (truncated or corrupt)")
+        if unpacked > MAX_RATIO[header.compression] * data_size + _RATIO_SLACK:
+            raise InputError(f"{where}: chunk {chunk} promises more than its packed bytes can hold (corrupt)")
+        total += unpacked
+    return total
+
+
+def part_label(headers: FileHeaders, part: int, path: str) -> str:
+    """How messages call a part: the file, and the part where there are several."""
+    return f"{path}: part {part}" if headers.multipart else path
+
+
+def _read_chunk_table(file: BinaryIO, file_size: int, headers: FileHeaders, part: int, path: str) -> NDArray[np.int64]:
+    """The part's chunk table as stored. Raises InputError when the file cannot hold the pixels the header promises."""
+    header, where = headers.parts[part], part_label(headers, part, path)
+    position = headers.end
+    for index in range(part):
+        position += 8 * chunk_count(headers.parts[index], part_label(headers, index, path))
+    window, chunks = header.data_window, chunk_count(header, where)
+    # The count tables hold 4 bytes per pixel, packed at best at the compression's largest ratio.
+    leaders = chunks * (8 + 4 * headers.multipart + _COORDINATES[header.type] + _SIZES.size)
+    tables = (4 * window.width * window.height - chunks * _RATIO_SLACK) // MAX_RATIO[header.compression]
+    if position + leaders + max(tables, 0) > file_size:
+        raise InputError(f"{where}: the header promises {window.width} x {window.height} pixels, more than the file's "
+                         f"{file_size} bytes can hold: truncated or corrupt")
+    file.seek(position)
+    return np.frombuffer(file.read(8 * chunks), "<i8")
 
 
 def _read_leaders(file: BinaryIO, file_size: int, header: Header, offsets: NDArray[np.int64], leader: int,
@@ -96,7 +128,7 @@ def _read_leaders(file: BinaryIO, file_size: int, header: Header, offsets: NDArr
         table_size, data_size, unpacked = _SIZES.unpack_from(data, leader - 24)
         row = y - window.ymin
         if not 0 <= row < rows:
-            raise InputError(f"{where}: row {window.ymin + index}: its chunk claims to be row {y}, outside the data window")
+            raise InputError(f"{where}: row {window.ymin + index}: its chunk claims to be row {y}, outside the window")
         if table.start[row] >= 0:
             raise InputError(f"{where}: row {y}: stored twice")
         if table_size + data_size > file_size - offset - leader:
@@ -115,7 +147,7 @@ def _walk(file: BinaryIO, file_size: int, headers: FileHeaders, part: int, path:
 
     Raises InputError unless every row of the part is there.
     """
-    position = headers.end + 8 * sum(chunk_count(header, f"{path}: part {index}")
+    position = headers.end + 8 * sum(chunk_count(header, part_label(headers, index, path))
                                      for index, header in enumerate(headers.parts))
     window = headers.parts[part].data_window
     found: dict[int, int] = {}
@@ -128,7 +160,7 @@ def _walk(file: BinaryIO, file_size: int, headers: FileHeaders, part: int, path:
         if not 0 <= number < len(headers.parts):
             break
         header = headers.parts[number]
-        coordinates = _COORDINATES[header.type]
+        coordinates = _COORDINATES.get(header.type, file_size)
         sizes = file.read(coordinates + (_SIZES.size if header.is_deep else 4))
         position += len(sizes)
         if len(sizes) < coordinates + 4 or (header.is_deep and len(sizes) < coordinates + _SIZES.size):

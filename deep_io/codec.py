@@ -8,6 +8,8 @@ Chunks and files are elsewhere; nothing here knows a path, so errors are ValueEr
 from __future__ import annotations
 
 import threading
+from itertools import pairwise
+from typing import Any
 
 import deflate
 import numpy as np
@@ -22,8 +24,8 @@ COMPRESSIONS = ("none", "rle", "zips")
 ISAL_LEVEL = 1  # 384 MB/s at a ratio of .54; zlib 4, OpenEXR's default, 30 MB/s at .49.
 
 # The most bytes that one packed byte can stand for: deflate's longest match is 258 bytes in 2 bits, RLE's longest
-# run 128 bytes in 2 bytes. The extra covers the smallest streams.
-MAX_RATIO = {"none": 1, "rle": 64, "zips": 1032}
+# run 128 bytes in 2 bytes, ZSTD's largest block 128 KiB in 4 bytes.
+MAX_RATIO = {"none": 1, "rle": 64, "zips": 1032, "zstd": 32768}
 
 # Below this many bytes NumPy's own cumsum is faster than the doubling scan.
 _SCAN_MIN_BYTES = 16384
@@ -102,14 +104,14 @@ def _undo_differences(raw: Bytes) -> Bytes:
         here, there = there, here
         span *= 2
     table = here.reshape(rows, width)
-    for above, row in zip(table[:-1], table[1:], strict=True):
+    for above, row in pairwise(table):
         np.add(row, above, out=row)
     return here[:size]
 
 
-def _buffer(name: str, size: int, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
+def _buffer(name: str, size: int, dtype: np.dtype[Any]) -> NDArray[Any]:
     """Scratch memory of this thread: fresh pages would cost more than the arithmetic on them."""
-    held: NDArray[np.generic] | None = getattr(_scratch, name, None)
+    held: NDArray[Any] | None = getattr(_scratch, name, None)
     if held is None or held.size < size:
         held = np.empty(size, dtype)
         setattr(_scratch, name, held)

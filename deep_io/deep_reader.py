@@ -7,6 +7,7 @@ library (library_reader.py), which needs the memory of the whole frame many time
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_io import codec
-from deep_io.chunks import read_row_table
+from deep_io.chunks import part_label, read_row_table
 from deep_io.errors import InputError
 from deep_io.header import FileHeaders, Header, open_input, parse_headers
 from deep_io.library_reader import LibraryRows
@@ -114,7 +115,7 @@ class DeepReader:
 
     def blocks(self, max_bytes: int = DEFAULT_BLOCK_BYTES, channels: Iterable[str] | None = None
                ) -> Iterator[DeepSamples]:
-        """The part in blocks of whole rows from top to bottom, each of at most `max_bytes` (a larger row stands alone)."""
+        """The part in blocks of whole rows from the top, each of at most `max_bytes` (a larger row stands alone)."""
         wanted = list(self._wanted(channels))
         sample_bytes = sum(self.header.channels[index].dtype.itemsize for index in self._wanted(wanted).values())
         window = self.header.data_window
@@ -155,11 +156,11 @@ class _ScanlineRows:
     """Rows of a deep scanline part, decoded straight into the caller's arrays."""
 
     def __init__(self, reader: DeepReader, headers: FileHeaders) -> None:
-        self._descriptor = reader._file.fileno()
-        self._where = f"{reader.path}: part {reader.part}" if headers.multipart else reader.path
+        self._file = reader._file
+        self._lock = threading.Lock()  # Seek and read must stay together; reading is a few percent of the work.
+        self._where = part_label(headers, reader.part, reader.path)
         self._header = reader.header
-        size = os.fstat(self._descriptor).st_size
-        self._table = read_row_table(reader._file, size, headers, reader.part, reader.path)
+        self._table = read_row_table(reader._file, headers, reader.part, reader.path)
         self.samples = self._table.samples
         # Where each channel begins in a row's uint16 pairs, per sample.
         self._pairs = np.cumsum([0] + [channel.dtype.itemsize // 2 for channel in self._header.channels]).tolist()
@@ -168,7 +169,9 @@ class _ScanlineRows:
         table_size, data_size = int(self._table.table_size[row]), int(self._table.data_size[row])
         total = int(self.samples[row])
         try:
-            chunk = memoryview(os.pread(self._descriptor, table_size + data_size, int(self._table.start[row])))
+            with self._lock:
+                self._file.seek(int(self._table.start[row]))
+                chunk = memoryview(self._file.read(table_size + data_size))
             if len(chunk) != table_size + data_size:
                 raise ValueError("the file ends within the row")
             _decode_counts(chunk[:table_size], counts, total, self._header.compression)
@@ -199,11 +202,12 @@ def _select(headers: FileHeaders, part: int | str | None, path: str) -> int:
     names = [header.name or str(index) for index, header in enumerate(headers.parts)]
     deep = [index for index, header in enumerate(headers.parts) if header.is_deep]
     if not deep:
-        raise InputError(f"{path}: is a flat EXR, without deep samples; make a deep sample file of several renders with "
-                         f"different seeds: lbmc pack FRAMES... OUT")
+        raise InputError(f"{path}: is a flat EXR, without deep samples; make a deep sample file from several "
+                         f"renders with different seeds: lbmc pack FRAMES... OUT")
     if part is None:
         if len(deep) > 1:
-            raise InputError(f"{path}: has {len(deep)} deep parts ({', '.join(names[i] for i in deep)}); choose one with --part")
+            choices = ", ".join(names[index] for index in deep)
+            raise InputError(f"{path}: has {len(deep)} deep parts; choose one with --part: {choices}")
         return deep[0]
     matches = [index for index, header in enumerate(headers.parts) if part in (index, header.name)]
     if not matches and isinstance(part, str) and part.isdecimal():
@@ -217,4 +221,5 @@ def _select(headers: FileHeaders, part: int | str | None, path: str) -> int:
 
 def default_threads() -> int:
     """The number of cores this process may use, at most 8."""
-    return min(MAX_THREADS, len(os.sched_getaffinity(0)))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(MAX_THREADS, cores)

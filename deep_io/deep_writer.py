@@ -10,7 +10,7 @@ import struct
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from types import TracebackType
-from typing import Self
+from typing import BinaryIO, Self
 
 import numpy as np
 
@@ -62,8 +62,7 @@ class DeepWriter:
         self._max_count = 0
         self._pool: ThreadPoolExecutor | None = None
         encoded = self._encode_start()
-        self._table_position = len(encoded)
-        self._file = open(path, "wb")
+        self._file = _create(path)
         self._file.write(encoded + self._rows.tobytes())
         threads = threads or default_threads()
         if threads > 1:
@@ -142,6 +141,10 @@ class DeepWriter:
             self.close()
         else:
             self._abandon()
+
+
+def _create(path: PathLike) -> BinaryIO:
+    return open(path, "wb")
 
 
 def _check_channels(header: Header) -> None:

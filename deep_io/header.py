@@ -229,7 +229,7 @@ def _named(names: tuple[str, ...], number: int) -> str:
 
 
 def _channels(data: bytes, where: str) -> tuple[Channel, ...]:
-    """A chlist: name, pixel type int32, linear uint8, 3 spare bytes, x and y sampling int32; ends with an empty name."""
+    """A chlist: per channel name, type int32, linear uint8, 3 spare bytes, x and y sampling int32; then a null."""
     channels: list[Channel] = []
     at = 0
     while True:

@@ -6,7 +6,6 @@ of the flat path. A MemoryCostWarning says so before it begins.
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Sequence
 from typing import Any, BinaryIO
@@ -14,16 +13,14 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_io.chunks import chunk_count
+from deep_io.chunks import check_chunks, part_label
 from deep_io.errors import InputError, MemoryCostWarning
 from deep_io.header import FileHeaders
 
 # What the library holds per pixel and channel besides the values: a NumPy array object and its reference, measured.
 _OBJECT_BYTES = 250
-# A chunk's leader: at least y, and three sizes of 8 bytes.
-_LEAST_CHUNK_BYTES = 8 + 28
-# Each pixel takes 4 bytes of count table, which ZSTD packs at most about so many times.
-_ZSTD_RATIO = 32768
+# The library's own frame, the arrays made of it and the flat arrays.
+_VALUE_COPIES = 3
 
 
 class LibraryRows:
@@ -35,17 +32,13 @@ class LibraryRows:
     def __init__(self, file: BinaryIO, headers: FileHeaders, part: int, path: str) -> None:
         header = headers.parts[part]
         window = header.data_window
-        where = f"{path}: part {part}" if headers.multipart else path
-        size = os.fstat(file.fileno()).st_size
-        chunks = sum(chunk_count(each, where) for each in headers.parts)
-        pixels = window.width * window.height
-        if headers.end + chunks * _LEAST_CHUNK_BYTES > size or 4 * pixels > size * _ZSTD_RATIO:
-            raise InputError(f"{where}: the header promises {window.width} x {window.height} pixels in {chunks} chunks, "
-                             f"more than the file's {size} bytes can hold: truncated or corrupt")
-        estimate = pixels * len(header.channels) * _OBJECT_BYTES
+        where = part_label(headers, part, path)
+        estimate = (check_chunks(file, headers, part, path) * _VALUE_COPIES
+                    + window.width * window.height * len(header.channels) * _OBJECT_BYTES)
         kind = "tiled" if header.type == "deeptile" else "ZSTD"
-        warnings.warn(f"{where}: {kind} deep data is read through the OpenEXR library, the whole frame at once: slow, and "
-                      f"about {estimate / 2**30:.1f} GiB of memory besides the samples", MemoryCostWarning, stacklevel=4)
+        warnings.warn(f"{where}: {kind} deep data is read through the OpenEXR library, the whole frame at once: slow, "
+                      f"and takes about {max(estimate >> 20, 1)} MiB of memory; ZIPS scanlines would stream",
+                      MemoryCostWarning, stacklevel=4)
         arrays = _read(path, part, where)
         if sorted(arrays) != sorted(header.channel_names):
             raise InputError(f"{where}: the OpenEXR library cannot read its pixels (corrupt?)")

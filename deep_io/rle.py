@@ -18,7 +18,7 @@ _JUMPS = 6        # Run starts are found 2^6 at a time.
 
 
 def decode(packed: Bytes, size: int) -> Bytes:
-    """The `size` bytes that `packed` stands for. Raises ValueError when it is cut short or stands for another number."""
+    """The `size` bytes that `packed` stands for. Raises ValueError when it is cut short or has another size."""
     starts = _run_starts(packed)
     counts = packed[starts].view(np.int8).astype(np.int64)
     literal = counts < 0

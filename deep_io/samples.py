@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,7 +87,7 @@ def concatenate(blocks: list[DeepSamples]) -> DeepSamples:
         raise ValueError("no block to concatenate")
     first, last = blocks[0], blocks[-1]
     names = list(first.channels)
-    for above, below in zip(blocks, blocks[1:], strict=False):
+    for above, below in pairwise(blocks):
         if below.window != above.window.rows(above.window.ymax + 1, below.window.ymax + 1):
             raise ValueError(f"rows {below.window} do not follow {above.window}")
         if list(below.channels) != names:
