@@ -1,0 +1,213 @@
+#!/usr/bin/env python3
+"""Quality on a folder of NAME.deep.exr + NAME.ref.exr: the noisy mean, an untrained baseline, Intel OIDN, and lbmc.
+
+    python benchmarks/quality.py FOLDER [--model fast] [--json OUT.json] [--panels DIR]
+
+Prints one Markdown row per scene and method (relMSE / SMAPE / PSNR / energy), and for each number of samples per pixel
+the geometric mean of relMSE and the means of the others. Errors are those of model/metrics.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import math
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from fnmatch import fnmatch
+from pathlib import Path
+
+import numpy as np
+
+from deep_io.errors import LbmcError
+from deep_io.path_samples import PathSamples, SampleReader
+from model.baseline import clamp_and_blur, pixel_means
+from model.metrics import Scores, bootstrap_interval, geometric_mean, score
+from pipelines.compare import read_rgb
+from pipelines.oidn import Oidn
+from pipelines.options import DenoiseOptions
+from pipelines.pictures import panel
+
+Picture = np.ndarray
+"""(H, W, 3) linear RGB."""
+
+
+@dataclasses.dataclass
+class Scene:
+    """One deep sample file in memory."""
+
+    path: Path
+    samples: PathSamples
+
+    @property
+    def name(self) -> str:
+        return self.path.name.removesuffix(".deep.exr")
+
+    @property
+    def per_pixel(self) -> int:
+        """Samples per pixel, rounded."""
+        return round(self.samples.total / self.samples.counts.size)
+
+    def mean(self, role: str) -> Picture:
+        return pixel_means(self.samples.counts, self.samples.weight, self.samples.roles[role])
+
+
+Method = Callable[[Scene], Picture]
+
+
+def oidn_methods(oidn: Oidn) -> dict[str, Method]:
+    """OIDN at high quality; the guides are plain means, 0 on misses, albedo without the specular colour."""
+
+    def guides(scene: Scene) -> tuple[Picture, Picture]:
+        return scene.mean("albedo"), scene.mean("normal")
+
+    return {
+        "OIDN color": lambda scene: oidn.denoise(scene.mean("radiance")),
+        "OIDN aux": lambda scene: oidn.denoise(scene.mean("radiance"), *guides(scene)),
+        "OIDN prefiltered": lambda scene: oidn.denoise(scene.mean("radiance"), *guides(scene), prefilter=True),
+    }
+
+
+def lbmc_method(model: str, threads: int | None, adapt: bool, layers: int | None) -> Method:
+    """`lbmc denoise` with one preset or weight file, through the same door as the command."""
+
+    def denoise(scene: Scene) -> Picture:
+        from pipelines.denoise import denoise_frames
+
+        with tempfile.TemporaryDirectory() as folder:
+            target = Path(folder) / "beauty.exr"
+            options = DenoiseOptions(
+                str(scene.path),
+                str(target),
+                model=model,
+                threads=threads,
+                adapt=adapt,
+                layers=layers,
+                pixel_type="float",
+                progress="none",
+            )
+            for frame in denoise_frames(options).failed:
+                raise SystemExit(f"ERROR: {frame.error}")
+            return read_rgb(target).rgb
+
+    return denoise
+
+
+def find_scenes(folder: Path, match: str) -> list[Path]:
+    """Deep sample files of a folder that have a reference. Ends the program when there are none."""
+    paths = [path for path in sorted(folder.glob("*.deep.exr")) if fnmatch(path.name, match)]
+    paths = [path for path in paths if reference_of(path).exists()]
+    if not paths:
+        sys.exit(f"ERROR: {folder}: no NAME.deep.exr with a NAME.ref.exr beside it matches {match!r}")
+    return paths
+
+
+def reference_of(path: Path) -> Path:
+    return path.with_name(path.name.replace(".deep.exr", ".ref.exr"))
+
+
+def cells(scores: Scores) -> str:
+    return f"{scores.relmse:.4f} / {scores.smape:.4f} / {scores.psnr:.2f} / {scores.energy:.3f}"
+
+
+def mean_cells(rows: list[Scores]) -> str:
+    smape, psnr, energy = (np.mean([getattr(row, name) for row in rows]) for name in ("smape", "psnr", "energy"))
+    errors = [row.relmse for row in rows]
+    low, high = bootstrap_interval(errors)
+    return f"**{geometric_mean(errors):.4f}** [{low:.4f}, {high:.4f}] / {smape:.4f} / {psnr:.2f} / {energy:.3f}"
+
+
+def table(results: dict[int, dict[str, dict[str, Scores]]], methods: list[str]) -> str:
+    """Markdown: rows are scenes grouped by samples per pixel, columns methods."""
+    lines = ["| scene | " + " | ".join(methods) + " |", "|---" * (len(methods) + 1) + "|"]
+    for per_pixel, scenes in sorted(results.items()):
+        for scene, row in scenes.items():
+            lines.append(f"| {scene} | " + " | ".join(cells(row[name]) for name in methods) + " |")
+        means = [mean_cells([row[name] for row in scenes.values()]) for name in methods]
+        lines.append(f"| **{len(scenes)} with {per_pixel} samples** | " + " | ".join(means) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--model", action="append", default=[], help="preset or .safetensors file; repeatable")
+    parser.add_argument("--match", default="*", help="only files whose name matches this glob")
+    parser.add_argument("--no-oidn", action="store_true")
+    parser.add_argument("--no-adapt", action="store_true")
+    parser.add_argument("--layers", type=int)
+    parser.add_argument("--flip", action="store_true", help="also FLIP (in the JSON)")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--panels", type=Path, help="folder for one PNG per scene")
+    options = parser.parse_args()
+
+    with Oidn(options.threads) as oidn:
+        methods: dict[str, Method] = {
+            "noisy": lambda scene: scene.mean("radiance"),
+            "baseline": lambda scene: clamp_and_blur(
+                scene.samples.counts, scene.samples.weight, scene.samples.roles["radiance"]
+            ),
+            **({} if options.no_oidn else oidn_methods(oidn)),
+        }
+        for model in options.model:
+            methods[f"lbmc {Path(model).stem}"] = lbmc_method(
+                model, options.threads, not options.no_adapt, options.layers
+            )
+        results: dict[int, dict[str, dict[str, Scores]]] = {}
+        seconds = dict.fromkeys(methods, 0.0)
+        for path in find_scenes(options.folder, options.match):
+            with SampleReader(path, threads=options.threads) as reader:
+                scene = Scene(path, reader.read())
+            reference = read_rgb(reference_of(path)).rgb
+            pictures: dict[str, Picture] = {}
+            for name, method in methods.items():
+                started = time.process_time()
+                pictures[name] = method(scene)
+                seconds[name] += time.process_time() - started
+            row = {name: score(picture, reference, with_flip=options.flip) for name, picture in pictures.items()}
+            results.setdefault(scene.per_pixel, {})[scene.name] = row
+            print(f"{scene.name}: " + "; ".join(f"{name} {row[name].relmse:.4f}" for name in row), file=sys.stderr)
+            if options.panels:
+                write_panel(options.panels, scene.name, pictures, row, reference)
+    print(table(results, list(methods)))
+    print("\nCPU s in all: " + ", ".join(f"{name} {spent:.1f}" for name, spent in seconds.items()))
+    if options.json:
+        options.json.write_text(json.dumps(as_json(results), indent=1) + "\n")
+
+
+def write_panel(
+    folder: Path, name: str, pictures: dict[str, Picture], row: dict[str, Scores], reference: Picture
+) -> None:
+    """Noisy, OIDN at its best, lbmc, the reference, and the signed error of the last of the denoised."""
+    wanted = [key for key in ("noisy", "OIDN prefiltered") if key in pictures]
+    wanted += [key for key in pictures if key.startswith("lbmc")]
+    titles = {f"{key}\nrelMSE {row[key].relmse:.4f}": pictures[key] for key in wanted}
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.png").write_bytes(panel(titles, reference, name))
+
+
+def as_json(results: dict[int, dict[str, dict[str, Scores]]]) -> dict[str, dict[str, dict[str, object]]]:
+    """scene -> method -> scores; what is not a finite number becomes null."""
+
+    def plain(value: float | None) -> float | None:
+        return value if value is not None and math.isfinite(value) else None
+
+    return {
+        scene: {
+            method: {key: plain(value) for key, value in dataclasses.asdict(scores).items()}
+            for method, scores in row.items()
+        }
+        for scenes in results.values()
+        for scene, row in scenes.items()
+    }
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except LbmcError as error:
+        sys.exit(f"ERROR: {error}")

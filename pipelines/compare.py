@@ -1,0 +1,146 @@
+"""Measures images against references: single files or sequences, as scores, heat maps and panels."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from math import isfinite, isnan
+from typing import Any
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from deep_io.errors import InputError
+from deep_io.header import read_headers
+from deep_io.samples import Window
+from model.metrics import Scores, geometric_mean, score
+from pipelines.pictures import heat_map, panel
+
+PathLike = str | os.PathLike[str]
+
+TITLES = {
+    "relmse": "relMSE",
+    "relmse_trimmed": "relMSE, worst 0.1 % of pixels left out",
+    "relmse_small_epsilon": "relMSE, epsilon 0.0001",
+    "relmse_unbiased": "relMSE, free of the reference's noise",
+    "floor": "relMSE of the reference itself",
+    "smape": "SMAPE",
+    "psnr": "PSNR (tone-mapped), dB",
+    "ssim": "SSIM (tone-mapped)",
+    "flip": "FLIP (HDR)",
+    "energy": "mean of image / mean of reference",
+}
+"""Field of Scores to its name for a reader, in the order shown."""
+GEOMETRIC = ("relmse", "relmse_trimmed", "relmse_small_epsilon")
+"""Averaged over images as geometric means; the others as means."""
+
+
+@dataclass(frozen=True)
+class FlatPicture:
+    """The colour of a flat EXR: `rgb` (H, W, 3) and where its pixels stand in the frame."""
+
+    path: str
+    rgb: NDArray[np.floating[Any]]
+    window: Window
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One image against its reference."""
+
+    image: FlatPicture
+    reference: FlatPicture
+    other_half: FlatPicture | None
+    scores: Scores
+
+    @property
+    def target(self) -> NDArray[np.floating[Any]]:
+        """The reference, or the mean of its two halves."""
+        if self.other_half is None:
+            return self.reference.rgb
+        mean: NDArray[np.floating[Any]] = (self.reference.rgb.astype(np.float64) + self.other_half.rgb) / 2.0
+        return mean
+
+    def heat_map(self) -> bytes:
+        """PNG of the signed relative error with its scale."""
+        return heat_map(self.image.rgb, self.target)
+
+    def panel(self) -> bytes:
+        """PNG of image, reference, error, and crops of the worst regions."""
+        name = os.path.basename(self.image.path)
+        return panel({name: self.image.rgb}, self.target)
+
+
+def compare(
+    image: PathLike, reference: PathLike, other_half: PathLike | None = None, *, with_flip: bool = True
+) -> Comparison:
+    """Measures one image; with `other_half`, the reference is the mean of two independent renderings.
+
+    Raises InputError for files that cannot be read as flat RGB, windows that differ (both are named), values that are
+    not finite and a reference without light.
+    """
+    pictures = [read_rgb(path) for path in (image, reference, *([other_half] if other_half is not None else []))]
+    for other in pictures[1:]:
+        if other.window != pictures[0].window:
+            raise InputError(f"{_placed(pictures[0])}, but {_placed(other)}; compare images of one window")
+    for picture in pictures:
+        bad = int(np.count_nonzero(~np.isfinite(picture.rgb).all(axis=-1)))
+        if bad:
+            raise InputError(f"{picture.path}: {bad} pixels are not finite, so no error can be measured")
+    half = pictures[2] if other_half is not None else None
+    try:
+        scores = score(pictures[0].rgb, pictures[1].rgb, half.rgb if half else None, with_flip=with_flip)
+    except ValueError as error:
+        raise InputError(f"{pictures[1].path}: {error}") from error
+    return Comparison(pictures[0], pictures[1], half, scores)
+
+
+def read_rgb(path: PathLike) -> FlatPicture:
+    """The R, G, B of the first part of a flat EXR that has them.
+
+    Raises InputError for a file that is missing, not an EXR, deep, or without R, G, B.
+    """
+    where = os.fspath(path)
+    headers = read_headers(where)
+    for number, header in enumerate(headers):
+        if {"R", "G", "B"} <= set(header.channel_names):
+            if header.is_deep:
+                raise InputError(f"{where}: is deep; compare what denoise made of it, a flat EXR")
+            channels = OpenEXR.File(where, separate_channels=True).parts[number].channels
+            rgb = np.stack([channels[name].pixels for name in "RGB"], axis=-1)
+            return FlatPicture(where, rgb, header.data_window)
+    raise InputError(f"{where}: no R, G, B channels (its channels: {', '.join(headers[0].channel_names)})")
+
+
+def mean_scores(rows: Sequence[Scores]) -> dict[str, float | None]:
+    """Geometric means of the relMSEs, means of the others; None where a metric is missing in some image."""
+    means: dict[str, float | None] = {}
+    for name in TITLES:
+        values = [getattr(row, name) for row in rows]
+        if not values or any(value is None for value in values):
+            means[name] = None
+        else:
+            means[name] = geometric_mean(values) if name in GEOMETRIC else float(np.mean(values))
+    return means
+
+
+def scores_as_dict(scores: Scores) -> dict[str, float | None]:
+    """For JSON, which knows no infinity: what is missing or not finite is None."""
+    return {name: value if value is not None and isfinite(value) else None for name, value in asdict(scores).items()}
+
+
+def score_lines(scores: Scores) -> list[str]:
+    """One line per metric that was measured."""
+    measured = {field.name: getattr(scores, field.name) for field in fields(scores)}
+    return [
+        f"{measured[name]:>12.6g}  {title}"
+        for name, title in TITLES.items()
+        if measured[name] is not None and not isnan(measured[name])
+    ]
+
+
+def _placed(picture: FlatPicture) -> str:
+    window = picture.window
+    return f"{picture.path} is {window.width} x {window.height} at ({window.xmin}, {window.ymin})"
