@@ -35,7 +35,8 @@ def pixel_means(
     """Weighted mean of `values` (N, C) over the samples of each pixel: (H, W, C); 0 where there are none."""
     pixel = np.repeat(np.arange(counts.size), counts.ravel())
     sums = [np.bincount(pixel, weight * channel.astype(np.float64), counts.size) for channel in values.T]
-    return np.stack(sums, axis=-1).reshape(*counts.shape, values.shape[1])
+    means: NDArray[np.float64] = np.stack(sums, axis=-1, dtype=np.float64).reshape(*counts.shape, values.shape[1])
+    return means
 
 
 def blur(image: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
