@@ -62,10 +62,11 @@ def depth_order(counts: Counts, depth: NDArray[np.floating[Any]] | None) -> Inde
     if ascends.all():
         return None
     unsorted = np.unique(np.searchsorted(offsets, np.flatnonzero(~ascends), side="right") - 1)
-    sizes = counts.ravel()[unsorted]
-    chosen = np.repeat(offsets[unsorted] - offsets_of(sizes)[:-1], sizes) + np.arange(sizes.sum(dtype=np.int64))
     order = np.arange(depth.size, dtype=np.int64)
-    order[chosen] = chosen[np.lexsort((depth[chosen], pixels_of(sizes)))]
+    sizes = counts.ravel()[unsorted]
+    for size in np.unique(sizes).tolist():  # pixels of one size make a table, and tables sort fast
+        places = offsets[unsorted[sizes == size]][:, None] + np.arange(size)
+        order[places] = np.take_along_axis(places, np.argsort(depth[places], axis=1, kind="stable"), axis=1)
     return order
 
 

@@ -139,8 +139,7 @@ def decode_block(counts: NDArray[np.int32], channels: dict[str, NDArray[np.gener
 def _weighted(weighting: str, counts: NDArray[np.int32], radiance: Values, alpha: NDArray[np.floating[Any]] | None,
               depth: Values | None) -> Weighted:
     if weighting == "uniform":
-        coverage = None if alpha is None else np.clip(alpha, 0, 1)
-        return decode_uniform(counts, radiance, coverage)
+        return decode_uniform(counts, radiance, None if alpha is None else np.clip(alpha.astype(np.float32), 0, 1))
     if alpha is None:
         raise ValueError(f"weighting {weighting} without alpha")
     # A depth that is not a number says nothing about the order: behind everything.
