@@ -1,0 +1,91 @@
+"""Frame patterns and ranges, on real folders with gaps and strangers in them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from deep_io.errors import InputError, UsageError
+from deep_io.sequences import expand, frame_path, is_sequence, pair, parse_frames, substitute
+
+
+@pytest.fixture
+def shot(tmp_path: Path) -> Path:
+    """Frames 1001 to 1003 and 1005, and files that only look like frames."""
+    for name in ("shot.1001.exr", "shot.1002.exr", "shot.1003.exr", "shot.1005.exr", "shot.1.exr", "shot.01004.exr",
+                 "shot.1004.jpg", "shotgun.1004.exr", ".shot.1004.1234.tmp.exr"):
+        (tmp_path / name).touch()
+    return tmp_path
+
+
+@pytest.mark.parametrize("pattern", ["shot.####.exr", "shot.%04d.exr", "shot.$F4.exr", "shot.@@@@.exr"])
+def test_every_style_of_pattern_finds_the_frames_on_disk_in_order(shot, pattern):
+    frames = expand(shot / pattern)
+    assert [frame.number for frame in frames] == [1001, 1002, 1003, 1005]
+    assert frames[0].source == shot / "shot.1001.exr"
+
+
+def test_a_range_chooses_frames_with_a_step_and_each_once(shot):
+    assert [frame.number for frame in expand(shot / "shot.####.exr", "1001-1005x2,1001")] == [1001, 1003, 1005]
+    assert [frame.number for frame in expand(shot / "shot.1001-1002####.exr")] == [1001, 1002]
+    assert parse_frames("3,1,2") == [3, 1, 2]
+
+
+def test_missing_frames_are_all_listed(shot):
+    with pytest.raises(InputError, match=r"shot\.####\.exr: 4 of 8 frames are missing: 1004,1006-1008$"):
+        expand(shot / "shot.####.exr", "1001-1008")
+
+
+def test_outputs_take_their_own_pattern(shot):
+    frames = pair(shot / "shot.####.exr", "out/clean.%05d.exr", "1001,1005")
+    assert [frame.target for frame in frames] == [Path("out/clean.01001.exr"), Path("out/clean.01005.exr")]
+
+
+def test_a_single_file_is_one_frame_without_a_number(shot):
+    (frame,) = pair(shot / "shot.1001.exr", shot / "out.exr")
+    assert (frame.number, frame.source, frame.target) == (None, shot / "shot.1001.exr", shot / "out.exr")
+    assert str(frame) == "shot.1001.exr"
+
+
+@pytest.mark.parametrize(("source", "target", "message"), [
+    ("shot.####.exr", "out.exr", "IN is a sequence .* but OUT is a single file.*out.####.exr"),
+    ("shot.1001.exr", "out.####.exr", "OUT is a sequence but IN"),
+    ("nothing.####.exr", "out.####.exr", "no file matches the pattern"),
+    ("absent/shot.####.exr", "out.####.exr", "the folder .*absent does not exist"),
+    ("absent.exr", "out.exr", "no such file"),
+    (".", "out.exr", "is a folder"),
+])
+def test_inputs_and_outputs_that_do_not_fit_are_unsuitable(shot, source, target, message):
+    with pytest.raises(InputError, match=message):
+        pair(shot / source, target)
+
+
+@pytest.mark.parametrize("text", ["1001-", "a-b", "", "1-5x0", "1001-1100x2y"])
+def test_ranges_that_cannot_be_read_are_usage_errors(shot, text):
+    with pytest.raises(UsageError, match="--frames"):
+        expand(shot / "shot.####.exr", text)
+
+
+def test_a_range_with_a_single_file_is_a_usage_error(shot):
+    with pytest.raises(UsageError, match="no pattern such as ####"):
+        expand(shot / "shot.1001.exr", "1001")
+
+
+def test_an_existing_file_with_a_hash_in_its_name_is_a_single_file(tmp_path):
+    (tmp_path / "take#2.exr").touch()
+    assert not is_sequence(tmp_path / "take#2.exr")
+    assert is_sequence(tmp_path / "take#3.exr")
+    assert not is_sequence("renders#2/beauty.exr")
+
+
+def test_a_hash_is_one_digit_and_negative_frames_are_files_too(tmp_path):
+    assert frame_path("shot.##.exr", 7) == Path("shot.07.exr")
+    (tmp_path / "shot.-005.exr").touch()
+    assert [frame.number for frame in expand(tmp_path / "shot.####.exr")] == [-5]
+
+
+def test_a_token_is_replaced_by_each_value(tmp_path):
+    assert substitute("s@SEED@.####.exr", "@SEED@", [1, 2]) == ["s1.####.exr", "s2.####.exr"]
+    with pytest.raises(UsageError, match="does not hold @SEED@"):
+        substitute("s.####.exr", "@SEED@", [1])
