@@ -8,7 +8,7 @@ SHELL := /bin/bash
 PYTHON ?= python3
 VENV := .venv
 BIN := $(abspath $(VENV))/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --quiet
 SOURCES := $(shell find deep_io lbmc_cli model pipelines -type f -not -path '*/__pycache__/*')
 TESTBED := build/testbed
 
@@ -16,8 +16,10 @@ TESTBED := build/testbed
 .DEFAULT_GOAL := demo
 
 $(VENV)/made:
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "ERROR: Python 3.11 or newer is needed, this is "
-	    + sys.version.split()[0] + "; name another with: make PYTHON=python3.12")'
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
+	  echo "ERROR: Python 3.11 or newer is needed, this is $$($(PYTHON) --version); try: make PYTHON=python3.12" >&2
+	  exit 1
+	}
 	$(PYTHON) -m venv --clear $(VENV)
 	$(PIP) install -c constraints.txt setuptools
 	touch $@
