@@ -24,7 +24,6 @@ import click
 COMMANDS = {
     "denoise": "Denoise a deep sample file, or a sequence of them, to a flat beauty.",
     "info": "Show what a deep sample file holds and how it would be read.",
-    "pack": "Pack one-sample flat renders into one deep sample file.",
     "compare": "Measure an image against its reference.",
     "models": "List the weights that are here.",
 }
