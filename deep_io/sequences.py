@@ -15,7 +15,6 @@ from fileseq.constants import PAD_STYLE_HASH1
 from fileseq.exceptions import FileSeqException
 from fileseq.filesequence import FileSequence
 from fileseq.frameset import FrameSet
-from fileseq.utils import framesToFrameRange
 
 from deep_io.errors import InputError, UsageError
 
@@ -72,14 +71,14 @@ def expand(source: PathLike, frames: str | None = None) -> list[Frame]:
     sequence = _sequence(source)
     if frames is not None:
         numbers = parse_frames(frames)
-    elif sequence.frameSet():
-        numbers = [int(number) for number in sequence.frameSet()]  # shot.1001-1010####.exr
+    elif written := sequence.frameSet():
+        numbers = [int(number) for number in written]  # shot.1001-1010####.exr
     else:
         numbers = _on_disk(source)
     found = [Frame(number, Path(sequence.frame(number))) for number in numbers]
     missing = [frame for frame in found if not frame.source.is_file()]
     if missing:
-        listed = framesToFrameRange([frame.number for frame in missing if frame.number is not None])
+        listed = FrameSet([frame.number for frame in missing if frame.number is not None])
         raise InputError(f"{os.fspath(source)}: {len(missing)} of {len(found)} frames are missing: {listed}")
     return found
 
@@ -102,7 +101,7 @@ def pair(source: PathLike, target: PathLike, frames: str | None = None) -> list[
     if not many:
         return [Frame(None, found[0].source, Path(target))]
     pattern = _sequence(target)
-    return [Frame(frame.number, frame.source, Path(pattern.frame(frame.number))) for frame in found]
+    return [Frame(frame.number, frame.source, Path(pattern.frame(str(frame.number)))) for frame in found]
 
 
 def substitute(pattern: PathLike, token: str, values: Sequence[object]) -> list[str]:
