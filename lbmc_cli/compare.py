@@ -2,23 +2,43 @@
 
 from __future__ import annotations
 
+import json
+from typing import Any
+
 import click
 
-from lbmc_cli.options import LbmcCommand, option
+from lbmc_cli.options import PROGRESS, LbmcCommand, option
+from lbmc_cli.report import end_job
 
 
 @click.command(cls=LbmcCommand)
 @click.argument("image", metavar="IMAGE")
 @click.argument("reference", metavar="REFERENCE")
+@option("--frames", metavar="RANGE", help="Frames of a sequence, e.g. 1001-1100x2.  [default: those that both have]")
 @option(
     "--other-half",
     metavar="FILE",
     help="REFERENCE and this are independent halves: also measure free of the reference's own noise.",
 )
 @option("--json", "as_json", is_flag=True, help="Print JSON.")
-def compare(image: str, reference: str, other_half: str | None, as_json: bool) -> None:
-    """Measure IMAGE against REFERENCE."""
-    from pipelines.compare import compare as run
-    from pipelines.compare import score_lines
+@option("--heatmap", "heat_map", metavar="PNG", help="Write the signed relative error as a picture with its scale.")
+@option("--panel", metavar="PNG", help="Write image, reference, error and crops of the worst regions.")
+@option("--overwrite", is_flag=True, help="Replace pictures that exist.")
+@option("--no-flip", "flip", is_flag=True, flag_value=False, default=True, help="Leave FLIP out, the slowest metric.")
+@PROGRESS
+def compare(as_json: bool, **choices: Any) -> int:
+    """Measure IMAGE against REFERENCE, two flat EXRs in linear light.
 
-    click.echo("\n".join(score_lines(run(image, reference, other_half).scores)))
+    All metrics but the energy are taken after one common scale, 0.5 / mean(min(reference, its 99th percentile)). Both
+    may be sequences (image.####.exr); then a table and the means are printed.
+    """
+    from pipelines.compare import CompareOptions, compare_frames, comparison_as_dict, comparison_lines
+
+    report = compare_frames(CompareOptions(**choices))
+    if as_json:
+        click.echo(json.dumps(comparison_as_dict(report.values), indent=2))
+    elif report.values:
+        click.echo("\n".join(comparison_lines(report.values)))
+    if len(report.frames) > 1:
+        return end_job(report)
+    return report.exit_code

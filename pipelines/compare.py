@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from math import isfinite, isnan
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from deep_io.errors import InputError
+from deep_io.atomic import atomic_output, output_action
+from deep_io.errors import InputError, UsageError
 from deep_io.header import read_headers
 from deep_io.samples import Window
+from deep_io.sequences import Frame, expand, frame_path, is_sequence
 from model.metrics import Scores, geometric_mean, score
+from pipelines.jobs import JobReport, run_frames
 from pipelines.pictures import heat_map, panel
+from pipelines.progress import Progress, ProgressKind, make_progress
 
 PathLike = str | os.PathLike[str]
 
@@ -73,6 +78,73 @@ class Comparison:
         return panel({name: self.image.rgb}, self.target)
 
 
+@dataclass(frozen=True)
+class CompareOptions:
+    """What a comparison is told; every path may be a sequence pattern."""
+
+    image: str
+    reference: str
+    """A single reference serves all frames of a sequence."""
+    other_half: str | None = None
+    """`reference` and this are independent renderings of one picture."""
+    frames: str | None = None
+    """Fileseq range. None: the frames that both sequences have."""
+    heat_map: str | None = None
+    """PNG to write; a pattern for sequences."""
+    panel: str | None = None
+    overwrite: bool = False
+    flip: bool = True
+    progress: ProgressKind = "auto"
+
+
+def compare_frames(options: CompareOptions) -> JobReport[Comparison]:
+    """Compares a file or all frames of a sequence and writes the pictures asked for.
+
+    Raises InputError when no frame is in common, UsageError for outputs that are refused. What is wrong with one frame
+    fails that frame only; see `compare`.
+    """
+    frames = _frames(options)
+    pictures: list[tuple[str, Callable[[Comparison], bytes]]] = []
+    for pattern, draw in ((options.heat_map, Comparison.heat_map), (options.panel, Comparison.panel)):
+        if pattern is None:
+            continue
+        pictures.append((pattern, draw))
+        if is_sequence(pattern) != is_sequence(options.image):
+            raise UsageError(f"{pattern}: write one picture per frame, such as error.####.png, for a sequence only")
+        for frame in frames:
+            inputs = [path for path in _inputs(options, frame) if path is not None]
+            output_action(_of_frame(pattern, frame), inputs, "overwrite" if options.overwrite else "refuse")
+
+    def work(frame: Frame, progress: Progress) -> Comparison:
+        comparison = compare(*_inputs(options, frame), with_flip=options.flip)
+        for pattern, draw in pictures:
+            with atomic_output(_of_frame(pattern, frame)) as path:
+                path.write_bytes(draw(comparison))
+        return comparison
+
+    with make_progress(options.progress if len(frames) > 1 else "none", len(frames)) as progress:
+        return run_frames(frames, work, progress)
+
+
+def _frames(options: CompareOptions) -> list[Frame]:
+    frames = expand(options.image, options.frames)
+    if options.frames is not None or not is_sequence(options.image):
+        return frames
+    common = [frame for frame in frames if _of_frame(options.reference, frame).is_file()]
+    if not common:
+        raise InputError(f"{options.image} and {options.reference} have no frame in common")
+    return common
+
+
+def _inputs(options: CompareOptions, frame: Frame) -> tuple[Path, Path, Path | None]:
+    half = None if options.other_half is None else _of_frame(options.other_half, frame)
+    return frame.source, _of_frame(options.reference, frame), half
+
+
+def _of_frame(pattern: str, frame: Frame) -> Path:
+    return frame_path(pattern, frame.number) if frame.number is not None and is_sequence(pattern) else Path(pattern)
+
+
 def compare(
     image: PathLike, reference: PathLike, other_half: PathLike | None = None, *, with_flip: bool = True
 ) -> Comparison:
@@ -127,8 +199,8 @@ def mean_scores(rows: Sequence[Scores]) -> dict[str, float | None]:
 
 
 def scores_as_dict(scores: Scores) -> dict[str, float | None]:
-    """For JSON, which knows no infinity: what is missing or not finite is None."""
-    return {name: value if value is not None and isfinite(value) else None for name, value in asdict(scores).items()}
+    """For JSON: what is missing or not finite is None."""
+    return _finite(asdict(scores))
 
 
 def score_lines(scores: Scores) -> list[str]:
@@ -139,6 +211,29 @@ def score_lines(scores: Scores) -> list[str]:
         for name, title in TITLES.items()
         if measured[name] is not None and not isnan(measured[name])
     ]
+
+
+def comparison_as_dict(rows: Sequence[Comparison]) -> dict[str, Any]:
+    """All images and their means as plain values, for JSON."""
+    images = [{"image": row.image.path, "reference": row.reference.path, **scores_as_dict(row.scores)} for row in rows]
+    return {"images": images, "mean": _finite(mean_scores([row.scores for row in rows]))}
+
+
+def comparison_lines(rows: Sequence[Comparison]) -> list[str]:
+    """One image: a line per metric. Several: a table, and their means in its last row."""
+    if len(rows) == 1:
+        return score_lines(rows[0].scores)
+    means = mean_scores([row.scores for row in rows])
+    shown = {os.path.basename(row.image.path): asdict(row.scores) for row in rows} | {"mean": means}
+    width = max(map(len, shown))
+    columns = [name for name in TITLES if means[name] is not None]
+    head = f"{'':{width}}" + "".join(f"{name.removeprefix('relmse_') or name:>15}" for name in columns)
+    return [head, *(f"{name:{width}}" + "".join(f"{row[c]:15.5g}" for c in columns) for name, row in shown.items())]
+
+
+def _finite(values: dict[str, float | None]) -> dict[str, float | None]:
+    """What is missing or not finite as None, since JSON knows no infinity."""
+    return {name: value if value is not None and isfinite(value) else None for name, value in values.items()}
 
 
 def _placed(picture: FlatPicture) -> str:

@@ -1,0 +1,137 @@
+"""`lbmc compare`, on flat EXRs made here: text, JSON, pictures, sequences, refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from model.metrics import score
+from tests.pipelines.test_compare import picture, write_flat
+from tests.runner import Finished, Runner, in_process
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> tuple[Path, Path]:
+    return write_flat(tmp_path / "image.exr", picture(0)), write_flat(tmp_path / "reference.exr", picture(1))
+
+
+def test_every_metric_is_a_line(lbmc: Runner, pair: tuple[Path, Path]) -> None:
+    run = lbmc("compare", *pair)
+    assert run.code == 0
+    assert run.err == ""
+    expected = score(picture(0), picture(1))
+    assert f"{expected.relmse:.6g}  relMSE\n" in run.out
+    for name in ("SMAPE", "PSNR", "SSIM", "FLIP", "worst 0.1 %", "epsilon 0.0001", "mean of image"):
+        assert name in run.out
+
+
+def test_json_holds_the_numbers(lbmc: Runner, pair: tuple[Path, Path]) -> None:
+    (found,) = json.loads(lbmc("compare", *pair, "--json").out)["images"]
+    expected = score(picture(0), picture(1))
+    assert found["image"] == str(pair[0])
+    for name in ("relmse", "relmse_trimmed", "relmse_small_epsilon", "smape", "psnr", "ssim", "flip", "energy"):
+        assert found[name] == pytest.approx(getattr(expected, name), rel=1e-9)
+
+
+def test_another_half_gives_the_unbiased_error(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    half = write_flat(tmp_path / "half.exr", picture(2))
+    run = in_process("compare", *pair, "--other-half", half, "--json", "--no-flip")
+    (found,) = json.loads(run.out)["images"]
+    assert found["relmse_unbiased"] == pytest.approx(score(picture(0), picture(1), picture(2)).relmse_unbiased)
+    assert found["flip"] is None
+
+
+def test_pictures_are_written_and_not_over_others(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    heat, panel = tmp_path / "heat.png", tmp_path / "panel.png"
+    words = ("compare", *pair, "--no-flip", "--heatmap", heat, "--panel", panel)
+    assert in_process(*words).code == 0
+    assert Image.open(heat).format == Image.open(panel).format == "PNG"
+    before = heat.stat().st_mtime_ns
+    refused = in_process(*words)
+    assert refused.code == 2
+    assert "--overwrite" in refused.err
+    assert heat.stat().st_mtime_ns == before
+    assert in_process(*words, "--overwrite").code == 0
+    assert heat.stat().st_mtime_ns > before
+
+
+def test_a_picture_never_lands_on_an_input(pair: tuple[Path, Path]) -> None:
+    before = pair[1].read_bytes()
+    run = in_process("compare", *pair, "--no-flip", "--heatmap", pair[1], "--overwrite")
+    assert run.code == 2
+    assert pair[1].read_bytes() == before
+
+
+@pytest.fixture
+def sequences(tmp_path: Path) -> Path:
+    """image.1001-1004 and reference.1002-1005."""
+    for number in range(1001, 1005):
+        write_flat(tmp_path / f"image.{number}.exr", picture(number))
+        write_flat(tmp_path / f"reference.{number + 1}.exr", picture(number + 10))
+    return tmp_path
+
+
+def test_sequences_give_a_table_of_the_common_frames_and_a_mean(lbmc: Runner, sequences: Path) -> None:
+    run = lbmc("compare", sequences / "image.####.exr", sequences / "reference.####.exr", "--no-flip")
+    assert run.code == 0
+    names = [line.split()[0] for line in run.out.splitlines()[1:]]
+    assert names == ["image.1002.exr", "image.1003.exr", "image.1004.exr", "mean"]
+    errors = [score(picture(n), picture(n + 9), with_flip=False).relmse for n in range(1002, 1005)]
+    mean = float(run.out.splitlines()[-1].split()[1])
+    assert mean == pytest.approx(float(np.exp(np.mean(np.log(errors)))), rel=1e-4)
+
+
+def test_a_frame_that_fails_is_listed_and_the_others_are_measured(sequences: Path) -> None:
+    (sequences / "image.1003.exr").write_bytes(b"broken")
+    words = ("compare", sequences / "image.####.exr", sequences / "reference.####.exr", "--no-flip", "--json")
+    run = in_process(*words)
+    assert run.code == 1
+    assert len(json.loads(run.out)["images"]) == 2
+    assert "failed frames:" in run.err
+    assert "1 failed" in run.err
+
+
+def test_one_reference_serves_a_whole_sequence(sequences: Path) -> None:
+    run = in_process("compare", sequences / "image.####.exr", sequences / "reference.1002.exr", "--no-flip", "--json")
+    assert len(json.loads(run.out)["images"]) == 4
+
+
+def test_sequences_write_a_picture_per_frame(sequences: Path) -> None:
+    words = ("compare", sequences / "image.####.exr", sequences / "reference.####.exr", "--no-flip", "--heatmap")
+    refused = in_process(*words, sequences / "error.png")
+    assert refused.code == 2
+    assert in_process(*words, sequences / "error.####.png").code == 0
+    assert sorted(path.name for path in sequences.glob("error*")) == [f"error.{n}.png" for n in range(1002, 1005)]
+
+
+def assert_one_line(run: Finished, *words: str) -> None:
+    assert run.code == 3
+    assert run.out == ""
+    assert run.err.startswith("ERROR: ")
+    assert run.err.count("\n") == 1
+    for word in words:
+        assert word in run.err
+
+
+def test_sizes_that_differ_are_both_said(lbmc: Runner, pair: tuple[Path, Path], tmp_path: Path) -> None:
+    other = write_flat(tmp_path / "other.exr", picture(1, (8, 9)))
+    assert_one_line(lbmc("compare", pair[0], other), "image.exr is 20 x 16", "other.exr is 9 x 8")
+
+
+def test_a_reference_without_light_is_refused(lbmc: Runner, pair: tuple[Path, Path], tmp_path: Path) -> None:
+    black = write_flat(tmp_path / "black.exr", np.zeros((16, 20, 3)))
+    assert_one_line(lbmc("compare", pair[0], black), "black.exr", "no light")
+
+
+def test_a_missing_reference_is_named(lbmc: Runner, pair: tuple[Path, Path], tmp_path: Path) -> None:
+    assert_one_line(lbmc("compare", pair[0], tmp_path / "none.exr"), "none.exr")
+
+
+def test_sequences_without_a_common_frame_are_refused(sequences: Path) -> None:
+    run = in_process("compare", sequences / "image.####.exr", sequences / "else.####.exr")
+    assert run.code == 3
+    assert "no frame in common" in run.err
