@@ -13,7 +13,7 @@ Targets keep their full resolution at every level, so coarse levels respect edge
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -75,7 +75,7 @@ class _Level:
         """The adjoint of padding and widening: (B, C, rows + 2r, (cols + 2r) * size) -> (B, C, rows, cols)."""
         radius = self.window // 2
         if self.size > 1:
-            wide = wide.unflatten(-1, (-1, self.size)).sum(-1)
+            wide = torch.unflatten(wide, -1, (-1, self.size)).sum(-1)
         return wide[..., radius : radius + self.rows, radius : radius + self.cols]
 
     def taps(self) -> Iterator[tuple[int, int, slice, slice]]:
@@ -134,7 +134,7 @@ class _AffinityFilter(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> Any:
         target, weights, out, *cells = ctx.saved_tensors
         levels = _levels(ctx.sizes, ctx.windows, cells)
         batch, _, height, width = target.shape
@@ -149,7 +149,7 @@ class _AffinityFilter(torch.autograd.Function):
             aim, pull, back = target.view(shape), grad.view(shape), grad_target.view(shape)
             base = common.view(batch, level.rows, level.size, width)
             wish = grad_preference[:, number].view(batch, level.rows, level.size, width)
-            bias, features, values = level.wide
+            features, values = level.wide[1:]
             to_bias, to_features, to_values = (torch.zeros_like(plane) for plane in level.wide)
             for _, _, rows, cols in level.taps():
                 weight = weights[tap].view(batch, level.rows, level.size, width)
@@ -207,7 +207,7 @@ def affinity_filter(
     for number, cell in enumerate(sizes):
         biased = log_n + source_bias[:, number]
         bias, means = pool_cells(biased, planes, cell)
-        feature, value = means.split([features.shape[1], values.shape[1]], 1)
+        feature, value = torch.split(means, [features.shape[1], values.shape[1]], 1)
         cells += [bias - feature.square().sum(1), feature, value]
-    out: Tensor = _AffinityFilter.apply(features, target_preference, sizes, tuple(windows), *cells)
-    return out[..., :height, :width]
+    apply: Callable[..., Tensor] = _AffinityFilter.apply
+    return apply(features, target_preference, sizes, tuple(windows), *cells)[..., :height, :width]

@@ -6,6 +6,7 @@ C_l = T_l (K R_l) / (K n_l),  V_l = T_l alpha_l,  A_l = T_l (K a_l) / (K n_l).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -43,6 +44,65 @@ def transmittance(alpha: Tensor) -> Tensor:
     return torch.cat([torch.ones_like(alpha[:, :1]), through[:, :-1]], 1)
 
 
+def composite(means: Tensor, joint_mass: Tensor | None = None) -> Tensor:
+    """Filtered layers -> what is visible of them.
+
+    Parameters
+    ----------
+    means : (B, L, 6, H, W) per unit of the filtered occupancy: radiance (3), coverage, coverage * depth, share w / n
+    joint_mass : (B, L, H, W) log of the filtered own weight. If given, the layers are averaged by it instead of being
+        composited front to back (LAYER_w), and `means` are per unit of that weight.
+
+    Returns
+    -------
+    (B, L, 6, H, W) visible planes, additive over layers: C (3), A, A * Z, V; 0 where no sample is in reach.
+    """
+    alpha = means[:, :, 5].clamp(0, 1)
+    if joint_mass is None:
+        visible = transmittance(alpha)
+        weight = visible * alpha
+    else:
+        reached = joint_mass.amax(1, keepdim=True) > -torch.inf
+        visible = weight = torch.softmax(torch.where(reached, joint_mass, 0), 1) * reached
+    planes = means[:, :, :5] * visible[:, :, None]
+    color, coverage, depth = torch.split(planes, [3, 1, 1], 2)
+    return torch.cat([color, torch.minimum(coverage, weight[:, :, None]), depth, weight[:, :, None]], 2)
+
+
+def mix_levels(finished: Sequence[Tensor], preference: Tensor) -> Tensor:
+    """The paper's pyramid: out = sum_i lambda_i up(G_i), every level composited to completion.
+
+    finished : visible planes of each level, (B, L, 6, H / 2**i, W / 2**i)
+    preference : (B, levels, H, W) logits of lambda; where a level reaches no sample its lambda goes to the others
+    """
+    if len(finished) == 1:
+        return finished[0]
+    size = finished[0].shape[-2:]
+    whole, reached = [], []
+    for level, planes in enumerate(finished):
+        weight = planes[:, :, 5].sum(1, keepdim=True)  # (B, 1, h, w): 1 where any sample is in reach, else 0
+        flat = torch.cat([planes.flatten(1, 2), weight], 1)
+        if level:
+            flat = F.interpolate(flat, size=size, mode="bilinear", align_corners=False)
+        up = flat[:, -1:]
+        some = up > 0
+        whole.append(torch.unflatten(flat[:, :-1] / torch.where(some, up, 1), 1, planes.shape[1:3]))
+        reached.append(some)
+    open_levels = torch.cat(reached, 1)  # (B, levels, H, W)
+    nowhere = ~open_levels.any(1, keepdim=True)
+    lam = torch.softmax(preference.masked_fill(~(open_levels | nowhere), -torch.inf), 1)
+    mixed = sum(lam[:, level, None, None] * planes for level, planes in enumerate(whole))
+    assert isinstance(mixed, Tensor)
+    return mixed
+
+
+def to_layers(visible: Tensor) -> Layers:
+    """Visible planes (B, L, 6, H, W), see `composite` -> `Layers`."""
+    color, coverage, depth, weight = visible[:, :, :3], visible[:, :, 3], visible[:, :, 4], visible[:, :, 5]
+    some = coverage > 0
+    return Layers(color, weight, coverage, torch.where(some, depth / torch.where(some, coverage, 1), torch.inf))
+
+
 def fill_holes(layers: Layers) -> Layers:
     """Fills targets that no sample reaches from weight-summed 2x2 push-pull levels, all layers together.
 
@@ -52,7 +112,7 @@ def fill_holes(layers: Layers) -> Layers:
     reached = layers.weight.sum(1, keepdim=True) > 0  # (B, 1, H, W)
     if bool(reached.all()) or not bool(reached.any()):
         return layers
-    batch, count, _, height, width = layers.color.shape
+    count, _, height, width = layers.color.shape[1:]
     depth = torch.where(layers.depth.isfinite(), layers.depth, 0) * layers.coverage
     stack = torch.cat([layers.color.flatten(1, 2), layers.weight, layers.coverage, depth, reached.to(depth.dtype)], 1)
     filled, known, size = stack, reached, 1
@@ -64,10 +124,6 @@ def fill_holes(layers: Layers) -> Layers:
         found = ~known & (up[:, -1:] > 0)
         filled = torch.where(found, up / torch.where(up[:, -1:] > 0, up[:, -1:], 1), filled)
         known = known | found
-    color, weight, coverage, depth, _ = filled.split((3 * count, count, count, count, 1), 1)
-    return Layers(
-        color=color.unflatten(1, (count, 3)),
-        weight=weight,
-        coverage=coverage,
-        depth=torch.where(coverage > 0, depth / torch.where(coverage > 0, coverage, 1), torch.inf),
-    )
+    color, *rest = torch.split(filled, [3 * count, count, count, count, 1], 1)
+    weight, coverage, depth = (plane[:, :, None] for plane in rest[:3])
+    return to_layers(torch.cat([torch.unflatten(color, 1, (count, 3)), coverage, depth, weight], 2))

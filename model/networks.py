@@ -6,6 +6,7 @@ Leaky ReLU (slope 0.01) after every layer but an MLP's last, Xavier initialisati
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -43,11 +44,11 @@ class Mlp(Products):
     def __init__(self, groups: Sequence[int], widths: Sequence[int]) -> None:
         super().__init__()
         self.groups = nn.ModuleList(nn.Linear(size, widths[0], bias=k == 0) for k, size in enumerate(groups))
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True))
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
         whole = nn.Linear(sum(groups), widths[0])  # Xavier sees the layer as one matrix
         _xavier(whole)
         with torch.no_grad():
-            for linear, block in zip(self.groups, whole.weight.split(list(groups), 1), strict=True):
+            for linear, block in zip(self.groups, torch.split(whole.weight, list(groups), 1), strict=True):
                 assert isinstance(linear, nn.Linear)
                 linear.weight.copy_(block)
                 if linear.bias is not None:
@@ -75,7 +76,7 @@ class _Block(nn.Module):
         super().__init__()
         sizes = [inputs, *widths]
         self.convolutions = nn.ModuleList(
-            nn.Conv2d(a, b, 3, padding=1) for a, b in zip(sizes[:-1], sizes[1:], strict=True)
+            nn.Conv2d(a, b, 3, padding=1) for a, b in pairwise(sizes)
         )
         for convolution in self.convolutions:
             assert isinstance(convolution, nn.Conv2d)

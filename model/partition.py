@@ -12,13 +12,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from model.config import MAX_LAYERS
 from model.features import FrameScale, log_depth
 from model.samples import Samples, Segments
 
 PRIOR_WINDOW = 9  # pixels; the neighbourhood that depth is compared with
 PRIOR_SPREAD = 0.1  # log units: depth differences well under this are one surface
 PRIOR_LIMIT = 4.0  # standard deviations
+
+# A splat's columns: log n, log w, then per unit of occupancy those of `basic_values`; what a variant adds follows.
+FILTERED = slice(2, 7)
+BASIC_COLUMNS = 7
 
 
 def kept_logits(layers: int, logits: int) -> list[int]:
@@ -28,9 +31,9 @@ def kept_logits(layers: int, logits: int) -> list[int]:
     return [*range(layers - 1), logits - 1]
 
 
-def layer_positions(logits: int, device: torch.device) -> Tensor:
-    """(logits,) positions of the layers in depth, -1 (front) to 1 (back)."""
-    return torch.linspace(-1.0, 1.0, logits, device=device) if logits > 1 else torch.ones(1, device=device)
+def layer_positions(logits: int, like: Tensor) -> Tensor:
+    """(logits,) positions of the layers in depth, -1 (front) to 1 (back), in the type of `like`."""
+    return torch.linspace(-1.0, 1.0, logits).to(like) if logits > 1 else like.new_ones(1)
 
 
 def relative_depth(samples: Samples, segments: Segments, scale: FrameScale) -> Tensor:
@@ -47,7 +50,7 @@ def relative_depth(samples: Samples, segments: Segments, scale: FrameScale) -> T
     moments = segments.sum(torch.cat([weight, weight * zeta, weight * zeta * zeta], 1))  # (P, 3)
     picture = moments.view(batch, height, width, 3).permute(0, 3, 1, 2)
     blurred = F.avg_pool2d(picture, PRIOR_WINDOW, 1, PRIOR_WINDOW // 2)
-    total, first, second = blurred.permute(0, 2, 3, 1).reshape(-1, 3).split(1, 1)
+    total, first, second = torch.split(blurred.permute(0, 2, 3, 1).reshape(-1, 3), 1, 1)
     some = total > 0
     safe = torch.where(some, total, 1)
     mean = first / safe
@@ -69,6 +72,23 @@ class LayerSplat:
     log_n: Tensor
     log_w: Tensor
     values: Tensor
+
+
+def hit_depth(samples: Samples, scale: FrameScale) -> tuple[Tensor, Tensor]:
+    """(N, 1) 1 on a hit, and depth, the frame's median on a miss."""
+    hit = (samples.coverage > 0).to(samples.roles["radiance"].dtype)[:, None]
+    return hit, torch.where(hit > 0, samples.roles["depth"], scale.depth) if "depth" in samples.roles else hit
+
+
+def basic_values(samples: Samples, scale: FrameScale) -> Tensor:
+    """(N, 5) what every variant filters: radiance, coverage, coverage * depth."""
+    coverage = samples.coverage[:, None]
+    return torch.cat([samples.roles["radiance"], coverage, coverage * hit_depth(samples, scale)[1]], 1)
+
+
+def share_of(log_n: Tensor, log_w: Tensor) -> Tensor:
+    """w / n in 0..1, 0 where nothing is."""
+    return torch.exp(log_w - torch.where(log_n == -torch.inf, 0, log_n))
 
 
 def splat(log_weight: Tensor, log_partition: Tensor, values: Tensor, segments: Segments) -> LayerSplat:
@@ -100,9 +120,23 @@ def splat(log_weight: Tensor, log_partition: Tensor, values: Tensor, segments: S
     )
 
 
-def initial_logits(relative: Tensor | None, strength: Tensor, keep: Sequence[int]) -> Tensor | float:
-    """What the depth prior adds to the kept partition logits: front samples towards front layers."""
+def initial_logits(relative: Tensor | None, strength: Tensor, keep: Sequence[int], logits: int) -> Tensor | float:
+    """What the depth prior adds to the kept ones of `logits` partition logits: front samples towards front layers."""
     if relative is None:
         return 0.0
-    positions = layer_positions(MAX_LAYERS, relative.device)[list(keep)]
-    return strength * relative * positions
+    return strength * relative * layer_positions(logits, relative)[list(keep)]
+
+
+def mixture(log_weight: Tensor, values: Tensor, segments: Segments) -> tuple[Tensor, Tensor]:
+    """Weighted means over each pixel's samples, for T columns of weights at once.
+
+    log_weight (N, T), values (N, C) -> log of the summed weights (P, T), -inf for none, and means (P, T, C).
+    """
+    peak = segments.max(log_weight)  # (P, T)
+    peak = torch.where(peak == -torch.inf, 0, peak)
+    weight = torch.exp(log_weight - segments.expand(peak))
+    sums = segments.weighted_sum(weight, torch.cat([values, torch.ones_like(values[:, :1])], 1))
+    total = sums[..., -1]
+    some = total > 0
+    safe = torch.where(some, total, 1)
+    return torch.where(some, torch.log(safe) + peak, -torch.inf), sums[..., :-1] / safe[..., None]

@@ -71,8 +71,8 @@ class Segments:
         if self.uniform is not None:
             left = weight.view(self.pixels, self.uniform, -1).transpose(1, 2)  # (P, L, n)
             return torch.bmm(left, per_sample.view(self.pixels, self.uniform, -1))
-        columns = [self.sum(weight[:, k : k + 1] * per_sample) for k in range(weight.shape[1])]
-        return torch.stack(columns, 1)
+        products = weight[:, :, None] * per_sample[:, None]  # (N, L, C)
+        return self.sum(products.flatten(1)).view(self.pixels, *products.shape[1:])
 
     def max(self, per_sample: Tensor) -> Tensor:
         """(N, C) -> (P, C): maxima over each pixel's samples, -inf for a pixel without any. Not differentiated."""

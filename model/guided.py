@@ -1,0 +1,90 @@
+"""The affinity kernels' stage: what is splatted besides radiance, how kernels are predicted, the demodulated path.
+
+Features for the affinity are predicted per layer and pixel; guides (normal, log depth, divisor) are added to them with
+a learned matrix, so that the kernel is a joint bilateral filter before any training. `affinity.py` has the filter.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from model.affinity import affinity_filter
+from model.config import DIVISOR_WINDOW, Config
+from model.features import FrameScale, divisor, log_depth
+from model.networks import Mlp
+from model.partition import BASIC_COLUMNS, FILTERED, hit_depth, share_of
+from model.samples import Samples
+
+GUIDE_SCALES = (2.0, 2.0, 2.0, 3.0, 1.5, 1.5, 1.5)  # normal, log depth, divisor: the joint bilateral filter at step 0
+DIVISOR_GUIDE_SCALE = 6.0  # the divisor's own, sharper kernel
+
+# Columns of a splat: log n, log w, then per unit of occupancy those of `basic_values`, of `guide_values`, embedding.
+REDUCED = slice(BASIC_COLUMNS, 10)  # demodulated radiance
+GUIDES = slice(10, 17)  # normal, log depth, divisor
+GUIDED_COLUMNS = 17
+
+
+def guide_values(samples: Samples, scale: FrameScale) -> Tensor:
+    """(N, 10) demodulated radiance, normal, log depth, divisor; 0 where a role is absent."""
+    radiance = samples.roles["radiance"]
+    hit, depth = hit_depth(samples, scale)
+    normal = samples.roles["normal"] * hit if "normal" in samples.roles else torch.zeros_like(radiance)
+    by = divisor(samples)
+    return torch.cat([radiance / by, normal, log_depth(depth, scale.depth), by], 1)
+
+
+def generator_sizes(config: Config) -> tuple[int, ...]:
+    """What the generator predicts per layer: features, bias and preference per level, guide gate;
+    with demodulation also the mix, the divisor's gate and the divisor's bias."""
+    levels = len(config.kernel_sizes)
+    sizes = (config.affinity_features, levels, levels, 1)
+    return (*sizes, 1, 1, 1) if config.demodulation else sizes
+
+
+def initial_guides(config: Config) -> Tensor:
+    """(features, guides): each guide starts in one feature, scaled by GUIDE_SCALES."""
+    guides = torch.zeros(config.affinity_features, len(GUIDE_SCALES))
+    for k, value in enumerate(GUIDE_SCALES):
+        guides[k % config.affinity_features, k] = value
+    return guides
+
+
+def predict(generator: Mlp, layer_bias: Tensor, planes: Tensor, context: Tensor) -> Tensor:
+    """Rows of the splat (P, L, K), context (P, C), layer_bias (L, hidden) -> (P, L, sum(generator_sizes)).
+
+    The generator sees the layer's mean embedding, its share w / n and its occupancy n.
+    """
+    log_n, log_w, values = planes[..., :1], planes[..., 1:2], planes[..., GUIDED_COLUMNS:]
+    share = share_of(log_n, log_w)
+    embedding = values / torch.where(share > 0, share, 1)
+    weight = torch.exp(log_n)  # below 1 where confidence is low or layers in front took the weight
+    shared = generator.first(0, context)[:, None]  # (P, 1, hidden)
+    mine = generator.first(1, torch.cat([embedding, share, weight], 2))
+    return generator.rest(shared + mine + layer_bias).to(planes.dtype)
+
+
+def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Parameter, config: Config) -> Tensor:
+    """Filters each layer by affinity, radiance along two paths if `config.demodulation`.
+
+    planes (B*L, K, H, W), predictions (B*L, sum(generator_sizes), H, W) -> (B*L, 6, H, W) per unit of filtered
+    occupancy: radiance, coverage, coverage * depth, share; 0 where no source is in reach.
+    """
+    log_n, log_w = planes[:, 0], planes[:, 1]
+    share = share_of(log_n, log_w)[:, None]
+    own = torch.where(share > 0, share, 1)  # values per unit of the layer's own weight: divide by this
+    features, bias, preference, gate, *divided = torch.split(predictions, list(generator_sizes(config)), 1)
+    guides = planes[:, GUIDES] / own
+    features = features + torch.einsum("bghw,fg->bfhw", guides, guide_matrix) * (2 * torch.sigmoid(gate))
+    values = torch.cat([planes[:, FILTERED], share, *([planes[:, REDUCED]] if config.demodulation else [])], 1)
+    out = affinity_filter(features, bias, preference, log_n, values, config.kernel_sizes)
+    if not config.demodulation:
+        return out
+    plain, others, reduced = torch.split(out, [3, 3, 3], 1)
+    mix, divisor_gate, divisor_bias = divided
+    by = guides[:, 4:]
+    sharp = by * (DIVISOR_GUIDE_SCALE * torch.sigmoid(divisor_gate))
+    factor = affinity_filter(sharp, divisor_bias, torch.zeros_like(divisor_bias), log_w, by, (DIVISOR_WINDOW,))
+    # no own weight near the target: nothing to multiply by, the plain path stands
+    amount = torch.sigmoid(mix) * (factor.amax(1, keepdim=True) > 0)
+    return torch.cat([torch.lerp(plain, reduced * factor, amount), others], 1)
