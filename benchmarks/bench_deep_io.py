@@ -31,7 +31,7 @@ import deflate
 import numpy as np
 
 from deep_io import DeepReader, DeepSamples, Window, read_deep, write_deep
-from deep_io.chunks import read_row_table
+from deep_io.chunks import read_rows
 from deep_io.header import parse_headers
 
 CHANNELS = ("R", "G", "B", "Z", "N.X", "N.Y", "N.Z", "albedo.R", "albedo.G", "albedo.B", "specular.R", "specular.G",
@@ -81,12 +81,10 @@ def write(path: Path, threads: int) -> Callable[[], object]:
 def floor(path: Path, threads: int) -> Callable[[], object]:
     with path.open("rb") as file:
         headers = parse_headers(file, str(path))
-        rows = read_row_table(file, headers, 0, str(path))
-    sample_bytes = headers.parts[0].sample_bytes
+        rows = read_rows(file, headers, 0, str(path))
     data = memoryview(path.read_bytes())
-    begins = (rows.start + rows.table_size).tolist()
-    pieces = [(data[begin:begin + size], samples * sample_bytes) for begin, size, samples
-              in zip(begins, rows.data_size.tolist(), rows.samples.tolist(), strict=True)]
+    begins = [row.start + row.table_size for row in rows]
+    pieces = [(data[begin:begin + row.data_size], row.unpacked) for begin, row in zip(begins, rows, strict=True)]
 
     def inflate() -> None:
         for packed, size in pieces:

@@ -1,8 +1,9 @@
-"""Where the rows of a deep scanline part lie in its file, found and checked before any pixel memory is allocated.
+"""Where the chunks of a deep part lie in its file, found and checked before any pixel memory is allocated.
 
-A chunk is one row: [part number int32, in multi-part files] y int32, packed size of the count table u64, packed size
-of the samples u64, unpacked size of the samples u64, table, samples. The chunk table lists where chunks begin; a
-writer that was killed leaves zeros in it, and then the chunks are found by walking through them.
+A chunk is one row or one tile: [part number int32, in multi-part files] y int32, or tile x, tile y, level x, level y
+int32; packed size of the count table u64, packed size of the samples u64, unpacked size of the samples u64; table;
+samples. The chunk table lists where chunks begin; a writer that was killed leaves zeros in it, and then the rows are
+found by walking through the chunks.
 """
 
 from __future__ import annotations
@@ -18,27 +19,32 @@ from numpy.typing import NDArray
 from deep_io.codec import MAX_RATIO
 from deep_io.errors import InputError
 from deep_io.header import FileHeaders, Header
+from deep_io.samples import Window
 
 _SIZES = struct.Struct("<3Q")
-# Bytes between the part number and the sizes in a chunk's leader: y for lines; tile x, y, level x, y for tiles.
+# Bytes between the part number and the sizes in a chunk's leader.
 _COORDINATES = {"scanlineimage": 4, "deepscanline": 4, "tiledimage": 16, "deeptile": 16}
-_RATIO_SLACK = 64  # Streams of a few bytes unpack to a little more than the ratio allows.
+_RATIO_SLACK = 64        # Streams of a few bytes unpack to a little more than the ratio allows.
+MAX_CHUNK = 2**31 - 1    # OpenEXR's own limit, packed and unpacked.
 
 
 @dataclass(frozen=True)
-class RowTable:
-    """One entry per row of the part, from the top of its data window, all (H,).
+class Chunk:
+    """One chunk: where its packed count table begins, and the sizes in bytes; the packed samples follow the table."""
 
-    start       int64   where the packed count table begins; the packed samples follow it
-    table_size  int64   bytes of the packed count table
-    data_size   int64   bytes of the packed samples
-    samples     int64   samples in the row
-    """
+    coordinates: tuple[int, ...]
+    start: int
+    table_size: int
+    data_size: int
+    unpacked: int
 
-    start: NDArray[np.int64]
-    table_size: NDArray[np.int64]
-    data_size: NDArray[np.int64]
-    samples: NDArray[np.int64]
+
+@dataclass(frozen=True)
+class Tile:
+    """A chunk of a tiled part and the pixels it covers, in absolute coordinates."""
+
+    chunk: Chunk
+    window: Window
 
 
 def chunk_count(header: Header, where: str) -> int:
@@ -54,41 +60,109 @@ def chunk_count(header: Header, where: str) -> int:
     return count
 
 
-def read_row_table(file: BinaryIO, headers: FileHeaders, part: int, path: str) -> RowTable:
-    """Find and check every row of deep scanline part number `part`.
+def read_rows(file: BinaryIO, headers: FileHeaders, part: int, path: str) -> list[Chunk]:
+    """The chunks of a deep scanline part, one for each row, from the top of its data window.
 
     Raises InputError, naming the file and where possible the row, when the part cannot hold what its header promises,
     a row is missing, doubled or out of the window, or a size does not fit the file.
     """
+    header, where = headers.parts[part], part_label(headers, part, path)
     file_size = os.fstat(file.fileno()).st_size
     offsets = _read_chunk_table(file, file_size, headers, part, path)
     if (offsets <= 0).any():
         offsets = _walk(file, file_size, headers, part, path)
-    leader = 4 * headers.multipart + 4 + _SIZES.size
-    return _read_leaders(file, file_size, headers.parts[part], offsets, leader, part_label(headers, part, path))
+    window = header.data_window
+    rows: dict[int, Chunk] = {}
+    for index, offset in enumerate(offsets.tolist()):
+        chunk = _read_leader(file, file_size, headers, part, offset, f"{where}: row {window.ymin + index}")
+        (y,) = chunk.coordinates
+        if not window.ymin <= y <= window.ymax:
+            raise InputError(f"{where}: row {window.ymin + index}: its chunk claims to be row {y}, outside the window")
+        if y in rows:
+            raise InputError(f"{where}: row {y}: stored twice")
+        _check_sizes(chunk, window.width, header, file_size, f"{where}: row {y}")
+        rows[y] = chunk
+    return [rows[y] for y in range(window.ymin, window.ymax + 1)]
+
+
+def read_tiles(file: BinaryIO, headers: FileHeaders, part: int, path: str, size: tuple[int, int]) -> list[list[Tile]]:
+    """The tiles of a deep tiled part's full-resolution level, row of tiles by row of tiles; `size` is theirs in pixels.
+
+    Raises InputError as read_rows does; an unfinished tiled file is not repaired.
+    """
+    header, where = headers.parts[part], part_label(headers, part, path)
+    file_size = os.fstat(file.fileno()).st_size
+    offsets = _read_chunk_table(file, file_size, headers, part, path)
+    window = header.data_window
+    across, down = -(-window.width // size[0]), -(-window.height // size[1])
+    if across * down > offsets.size:
+        raise InputError(f"{where}: {across} x {down} tiles do not fit the header's {offsets.size} chunks (corrupt)")
+    tiles: dict[tuple[int, int], Tile] = {}
+    for index, offset in enumerate(offsets.tolist()):
+        chunk = _read_leader(file, file_size, headers, part, offset, f"{where}: tile {index} of {offsets.size}")
+        x, y, *level = chunk.coordinates
+        if level != [0, 0]:  # A smaller copy of the picture.
+            continue
+        if not (0 <= x < across and 0 <= y < down):
+            raise InputError(f"{where}: tile {index} of {offsets.size} claims to be tile {x}, {y}, outside the window")
+        left, top = window.xmin + x * size[0], window.ymin + y * size[1]
+        covers = Window(left, top, min(left + size[0] - 1, window.xmax), min(top + size[1] - 1, window.ymax))
+        if (y, x) in tiles:
+            raise InputError(f"{where}: row {top}: tile {x}, {y} is stored twice")
+        # OpenEXR stores an uncompressed count table in full length where the window's edge cuts the tile.
+        spare = 4 * (size[0] * size[1] - covers.width * covers.height)
+        label = f"{where}: row {top}: tile {x}, {y}"
+        _check_sizes(chunk, covers.width * covers.height, header, file_size, label, spare)
+        tiles[y, x] = Tile(chunk, covers)
+    missing = next(((x, y) for y in range(down) for x in range(across) if (y, x) not in tiles), None)
+    if missing is not None:
+        x, y = missing
+        raise InputError(f"{where}: row {window.ymin + y * size[1]}: tile {x}, {y} is missing (truncated or corrupt)")
+    return [[tiles[y, x] for x in range(across)] for y in range(down)]
 
 
 def check_chunks(file: BinaryIO, headers: FileHeaders, part: int, path: str) -> int:
-    """Check the chunk sizes of any deep part, also tiled and ZSTD, against the file; the bytes they unpack to.
+    """Check the chunk sizes of any deep part against the file; the number of bytes its samples unpack to.
 
     Raises InputError when the part cannot hold what its header promises or a chunk does not fit the file.
     """
+    header, where = headers.parts[part], part_label(headers, part, path)
     file_size = os.fstat(file.fileno()).st_size
     offsets = _read_chunk_table(file, file_size, headers, part, path)
-    header, where = headers.parts[part], part_label(headers, part, path)
-    before = 4 * headers.multipart + _COORDINATES[header.type]
     total = 0
-    for chunk, offset in enumerate(offsets.tolist()):
-        if not 0 < offset <= file_size - before - _SIZES.size:
-            raise InputError(f"{where}: chunk {chunk} of {offsets.size} is missing (truncated or corrupt)")
-        file.seek(offset + before)
-        table_size, data_size, unpacked = _SIZES.unpack(file.read(_SIZES.size))
-        if table_size + data_size > file_size - offset - before - _SIZES.size:
-            raise InputError(f"{where}: chunk {chunk} runs past the end of the file (truncated or corrupt)")
-        if unpacked > MAX_RATIO[header.compression] * data_size + _RATIO_SLACK:
-            raise InputError(f"{where}: chunk {chunk} promises more than its packed bytes can hold (corrupt)")
-        total += unpacked
+    for index, offset in enumerate(offsets.tolist()):
+        label = f"{where}: chunk {index} of {offsets.size}"
+        chunk = _read_leader(file, file_size, headers, part, offset, label)
+        _check_sizes(chunk, None, header, file_size, label)
+        total += chunk.unpacked
     return total
+
+
+def _read_leader(file: BinaryIO, file_size: int, headers: FileHeaders, part: int, offset: int, label: str) -> Chunk:
+    coordinates = _COORDINATES[headers.parts[part].type]
+    before = 4 * headers.multipart
+    start = offset + before + coordinates + _SIZES.size
+    if not 0 < offset <= start <= file_size:
+        raise InputError(f"{label}: the chunk table points outside the file (truncated or corrupt)")
+    file.seek(offset)
+    data = file.read(start - offset)
+    if before and struct.unpack_from("<i", data)[0] != part:
+        raise InputError(f"{label}: its chunk belongs to another part (corrupt)")
+    return Chunk(struct.unpack_from(f"<{coordinates // 4}i", data, before), start,
+                 *_SIZES.unpack_from(data, before + coordinates))
+
+
+def _check_sizes(chunk: Chunk, pixels: int | None, header: Header, file_size: int, label: str, spare: int = 0) -> None:
+    """Refuse sizes beyond the file, and contents that no packed data of that size can stand for."""
+    ratio = MAX_RATIO[header.compression]
+    if chunk.table_size + chunk.data_size > file_size - chunk.start:
+        raise InputError(f"{label}: runs past the end of the file (truncated or corrupt)")
+    if (chunk.unpacked % header.sample_bytes or max(chunk.unpacked, chunk.data_size, chunk.table_size) > MAX_CHUNK
+            or (pixels is not None and chunk.table_size > 4 * pixels + spare)):
+        raise InputError(f"{label}: its sizes do not fit its channels (corrupt)")
+    if (chunk.unpacked > ratio * chunk.data_size + _RATIO_SLACK
+            or (pixels is not None and 4 * pixels > ratio * chunk.table_size + _RATIO_SLACK)):
+        raise InputError(f"{label}: promises more than its packed bytes can hold (corrupt)")
 
 
 def part_label(headers: FileHeaders, part: int, path: str) -> str:
@@ -111,35 +185,6 @@ def _read_chunk_table(file: BinaryIO, file_size: int, headers: FileHeaders, part
                          f"{file_size} bytes can hold: truncated or corrupt")
     file.seek(position)
     return np.frombuffer(file.read(8 * chunks), "<i8")
-
-
-def _read_leaders(file: BinaryIO, file_size: int, header: Header, offsets: NDArray[np.int64], leader: int,
-                  where: str) -> RowTable:
-    window, rows = header.data_window, offsets.size
-    table = RowTable(*(np.full(rows, -1, np.int64) for _ in range(4)))
-    ratio, sample_bytes = MAX_RATIO[header.compression], header.sample_bytes
-    for index, offset in enumerate(offsets.tolist()):
-        if not 0 < offset <= file_size - leader:
-            raise InputError(f"{where}: row {window.ymin + index}: the chunk table points outside the file "
-                             f"(truncated or corrupt)")
-        file.seek(offset)
-        data = file.read(leader)
-        y = struct.unpack_from("<i", data, leader - 28)[0]
-        table_size, data_size, unpacked = _SIZES.unpack_from(data, leader - 24)
-        row = y - window.ymin
-        if not 0 <= row < rows:
-            raise InputError(f"{where}: row {window.ymin + index}: its chunk claims to be row {y}, outside the window")
-        if table.start[row] >= 0:
-            raise InputError(f"{where}: row {y}: stored twice")
-        if table_size + data_size > file_size - offset - leader:
-            raise InputError(f"{where}: row {y}: runs past the end of the file (truncated or corrupt)")
-        if unpacked % sample_bytes or table_size > 4 * window.width:
-            raise InputError(f"{where}: row {y}: its sizes do not fit its channels (corrupt)")
-        if 4 * window.width > ratio * table_size + _RATIO_SLACK or unpacked > ratio * data_size + _RATIO_SLACK:
-            raise InputError(f"{where}: row {y}: promises more than its packed bytes can hold (corrupt)")
-        table.start[row], table.table_size[row], table.data_size[row] = offset + leader, table_size, data_size
-        table.samples[row] = unpacked // sample_bytes
-    return table
 
 
 def _walk(file: BinaryIO, file_size: int, headers: FileHeaders, part: int, path: str) -> NDArray[np.int64]:

@@ -1,44 +1,32 @@
 """Deep EXRs into flat arrays, by blocks of rows, any subset of the channels, on several threads.
 
-Deep scanline parts compressed with NONE, RLE or ZIPS are decoded here. Tiled parts and ZSTD go through the OpenEXR
-library (library_reader.py), which needs the memory of the whole frame many times over.
+Scanline and tiled parts compressed with NONE, RLE or ZIPS are decoded by rows.py. ZSTD goes through the OpenEXR library
+(library_reader.py), which needs the memory of the whole frame many times over.
 """
 
 from __future__ import annotations
 
 import os
-import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deep_io import codec
-from deep_io.chunks import part_label, read_row_table
 from deep_io.errors import InputError
 from deep_io.header import FileHeaders, Header, open_input, parse_headers
 from deep_io.library_reader import LibraryRows
+from deep_io.rows import RowDecoder, ScanlineRows, TileRows
 from deep_io.samples import DeepSamples
 
 DEFAULT_BLOCK_BYTES = 64 << 20
 MAX_THREADS = 8  # More only wait for each other: NumPy's calls on one line are short.
-_ROWS_PER_TASK = 8
 
 PathLike = str | os.PathLike[str]
-
-
-class _Rows(Protocol):
-    """What decodes rows; `samples` is (H,) int64, the samples in each row of the data window."""
-
-    samples: NDArray[np.int64]
-
-    def decode(self, row: int, counts: NDArray[np.int32], channels: Sequence[tuple[int, NDArray[np.generic]]]) -> None:
-        """Write row's counts (W,) and, for (channel index, destination) pairs, its samples. Raises InputError."""
-
-    def close(self) -> None: ...
 
 
 class DeepReader:
@@ -66,13 +54,14 @@ class DeepReader:
         self.threads = threads or default_threads()
         self._pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
 
-    def _open_rows(self, headers: FileHeaders) -> _Rows:
+    def _open_rows(self, headers: FileHeaders) -> RowDecoder:
         header = self.header
         if any(channel.sampling != (1, 1) for channel in header.channels) or not header.channels:
             raise InputError(f"{self.path}: deep channels must exist and not be subsampled")
-        if header.compression in codec.COMPRESSIONS and header.type == "deepscanline":
-            return _ScanlineRows(self, headers)
-        if header.compression in (*codec.COMPRESSIONS, "zstd"):
+        if header.compression in codec.COMPRESSIONS:
+            decoder = TileRows if header.type == "deeptile" else ScanlineRows
+            return decoder(self._file, headers, self.part, self.path)
+        if header.compression == "zstd":
             return LibraryRows(self._file, headers, self.part, self.path)
         raise InputError(f"{self.path}: deep data cannot be compressed with {header.compression}; write it with ZIPS")
 
@@ -104,38 +93,39 @@ class DeepReader:
         counts = np.empty((y1 - y0, window.width), np.int32)
         arrays = {name: np.empty(offsets[-1], self.header.channels[index].dtype) for name, index in wanted.items()}
 
-        def decode(rows: range) -> None:
-            for row in rows:
-                begin, end = offsets[row - first], offsets[row - first + 1]
-                self._rows.decode(row, counts[row - first],
-                                  [(wanted[name], values[begin:end]) for name, values in arrays.items()])
+        targets = [(wanted[name], values) for name, values in arrays.items()]
 
-        self._for_rows(decode, first, last)
+        def decode(rows: range) -> None:
+            here = slice(rows.start - first, rows.stop - first)
+            self._rows.decode(rows, counts[here], targets, offsets[here])
+
+        tasks = _pieces(first, last, self._rows.task)
+        for _ in self._pool.map(decode, tasks) if self._pool else map(decode, tasks):
+            pass  # Waits, and raises what a thread raised.
         return DeepSamples(counts, arrays, window.rows(y0, y1))
 
     def blocks(self, max_bytes: int = DEFAULT_BLOCK_BYTES, channels: Iterable[str] | None = None
                ) -> Iterator[DeepSamples]:
-        """The part in blocks of whole rows from the top, each of at most `max_bytes` (a larger row stands alone)."""
+        """The part in blocks of whole rows from the top, each of at most `max_bytes`.
+
+        A larger row, or row of tiles, is a block by itself.
+        """
         wanted = list(self._wanted(channels))
         sample_bytes = sum(self.header.channels[index].dtype.itemsize for index in self._wanted(wanted).values())
         window = self.header.data_window
         row_bytes = self._rows.samples * sample_bytes + 4 * window.width
         first, held = 0, 0
-        for row, size in enumerate(row_bytes.tolist()):
+        for piece in _pieces(0, window.height, self._rows.block):
+            size = int(row_bytes[piece.start:piece.stop].sum())
             if held and held + size > max_bytes:
-                yield self.read(window.ymin + first, window.ymin + row, wanted)
-                first, held = row, 0
+                yield self.read(window.ymin + first, window.ymin + piece.start, wanted)
+                first, held = piece.start, 0
             held += size
         yield self.read(window.ymin + first, window.ymax + 1, wanted)
 
     def _wanted(self, channels: Iterable[str] | None) -> dict[str, int]:
         index = {name: position for position, name in enumerate(self.header.channel_names)}
         return index if channels is None else {name: index[name] for name in channels}
-
-    def _for_rows(self, work: Callable[[range], None], first: int, last: int) -> None:
-        tasks = [range(row, min(row + _ROWS_PER_TASK, last)) for row in range(first, last, _ROWS_PER_TASK)]
-        for _ in (self._pool.map(work, tasks) if self._pool else map(work, tasks)):
-            pass
 
     def close(self) -> None:
         """Close the file; the reader is of no use afterwards."""
@@ -150,51 +140,6 @@ class DeepReader:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
         self.close()
-
-
-class _ScanlineRows:
-    """Rows of a deep scanline part, decoded straight into the caller's arrays."""
-
-    def __init__(self, reader: DeepReader, headers: FileHeaders) -> None:
-        self._file = reader._file
-        self._lock = threading.Lock()  # Seek and read must stay together; reading is a few percent of the work.
-        self._where = part_label(headers, reader.part, reader.path)
-        self._header = reader.header
-        self._table = read_row_table(reader._file, headers, reader.part, reader.path)
-        self.samples = self._table.samples
-        # Where each channel begins in a row's uint16 pairs, per sample.
-        self._pairs = np.cumsum([0] + [channel.dtype.itemsize // 2 for channel in self._header.channels]).tolist()
-
-    def decode(self, row: int, counts: NDArray[np.int32], channels: Sequence[tuple[int, NDArray[np.generic]]]) -> None:
-        table_size, data_size = int(self._table.table_size[row]), int(self._table.data_size[row])
-        total = int(self.samples[row])
-        try:
-            with self._lock:
-                self._file.seek(int(self._table.start[row]))
-                chunk = memoryview(self._file.read(table_size + data_size))
-            if len(chunk) != table_size + data_size:
-                raise ValueError("the file ends within the row")
-            _decode_counts(chunk[:table_size], counts, total, self._header.compression)
-            if not channels or not total:
-                return
-            line = codec.decode(chunk[table_size:], total * self._header.sample_bytes, self._header.compression)
-            for index, values in channels:
-                values.view(np.uint16)[:] = line[self._pairs[index] * total:self._pairs[index + 1] * total]
-        except (ValueError, OSError) as error:
-            y = self._header.data_window.ymin + row
-            raise InputError(f"{self._where}: row {y}: {error}") from error
-
-    def close(self) -> None:
-        """Nothing to release: the reader owns the file."""
-
-
-def _decode_counts(packed: memoryview, counts: NDArray[np.int32], total: int, compression: str) -> None:
-    """A row's count table, which holds running sums, into counts (W,). Raises ValueError unless they sum to `total`."""
-    sums = codec.decode(packed, 4 * counts.size, compression).view("<i4")
-    counts[0] = sums[0]
-    np.subtract(sums[1:], sums[:-1], out=counts[1:])
-    if int(sums[-1]) != total or sums[0] < 0 or (sums[1:] < sums[:-1]).any():
-        raise ValueError(f"the sample counts are corrupt: they must rise to {total}")
 
 
 def _select(headers: FileHeaders, part: int | str | None, path: str) -> int:
@@ -217,6 +162,12 @@ def _select(headers: FileHeaders, part: int | str | None, path: str) -> int:
     if matches[0] not in deep:
         raise InputError(f"{path}: part {part!r} is flat; the deep parts are {', '.join(names[i] for i in deep)}")
     return matches[0]
+
+
+def _pieces(first: int, last: int, size: int) -> list[range]:
+    """Rows first to last exclusive, cut at the multiples of `size`."""
+    cuts = [first, *range((first // size + 1) * size, last, size), last]
+    return [range(begin, end) for begin, end in pairwise(cuts)]
 
 
 def default_threads() -> int:

@@ -16,6 +16,7 @@ import numpy as np
 
 from deep_io import codec
 from deep_io.attributes import attribute
+from deep_io.chunks import MAX_CHUNK
 from deep_io.deep_reader import PathLike, default_threads
 from deep_io.header import (
     FORMAT_VERSION,
@@ -92,8 +93,8 @@ class DeepWriter:
 
         def encode(row: int) -> tuple[bytes, bytes, int]:
             begin, end = int(row_ends[row - 1]) if row else 0, int(row_ends[row])
-            if end - begin > np.iinfo(np.int32).max:
-                raise ValueError(f"row {window.ymin + row} has more samples than a deep file's count table can say")
+            if 2 * sum(widths) * (end - begin) > MAX_CHUNK:
+                raise ValueError(f"row {window.ymin + row} has {end - begin} samples, more than a chunk of 2 GiB holds")
             line = np.concatenate([values[begin * width:end * width]
                                    for values, width in zip(pairs, widths, strict=True)])
             sums = np.cumsum(samples.counts[row], dtype="<i4")

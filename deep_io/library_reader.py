@@ -1,4 +1,4 @@
-"""Deep parts that deep_reader.py does not decode itself (tiled, or ZSTD), read whole through the OpenEXR library.
+"""Deep parts that rows.py does not decode (ZSTD), read whole through the OpenEXR library.
 
 The library makes a Python object per pixel and channel: many times the memory of the samples and ten times the time
 of the flat path. A MemoryCostWarning says so before it begins.
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from deep_io.chunks import check_chunks, part_label
 from deep_io.errors import InputError, MemoryCostWarning
 from deep_io.header import FileHeaders
+from deep_io.rows import Targets
 
 # What the library holds per pixel and channel besides the values: a NumPy array object and its reference, measured.
 _OBJECT_BYTES = 250
@@ -24,10 +25,12 @@ _VALUE_COPIES = 3
 
 
 class LibraryRows:
-    """All rows of a deep part, read by the library when it is opened; the counterpart of deep_reader._ScanlineRows.
+    """All rows of a deep part, read by the library when it is opened; a RowDecoder of rows.py.
 
     Raises InputError for a part the file cannot hold or the library cannot read.
     """
+
+    block, task = 1, 64
 
     def __init__(self, file: BinaryIO, headers: FileHeaders, part: int, path: str) -> None:
         header = headers.parts[part]
@@ -35,9 +38,8 @@ class LibraryRows:
         where = part_label(headers, part, path)
         estimate = (check_chunks(file, headers, part, path) * _VALUE_COPIES
                     + window.width * window.height * len(header.channels) * _OBJECT_BYTES)
-        kind = "tiled" if header.type == "deeptile" else "ZSTD"
-        warnings.warn(f"{where}: {kind} deep data is read through the OpenEXR library, the whole frame at once: slow, "
-                      f"and takes about {max(estimate >> 20, 1)} MiB of memory; ZIPS scanlines would stream",
+        warnings.warn(f"{where}: ZSTD deep data is read through the OpenEXR library, the whole frame at once: slow, "
+                      f"and takes about {max(estimate >> 20, 1)} MiB of memory; ZIPS would stream",
                       MemoryCostWarning, stacklevel=4)
         arrays = _read(path, part, where)
         if sorted(arrays) != sorted(header.channel_names):
@@ -60,12 +62,13 @@ class LibraryRows:
         self.samples = self._counts.sum(axis=1, dtype=np.int64)
         self._starts = np.concatenate(([0], np.cumsum(self.samples))).tolist()
 
-    def decode(self, row: int, counts: NDArray[np.int32], channels: Sequence[tuple[int, NDArray[np.generic]]]) -> None:
-        """Copy a row out; see deep_reader._Rows."""
+    def decode(self, rows: range, counts: NDArray[np.int32], targets: Targets, starts: Sequence[int]) -> None:
+        """Copy rows out; see rows.RowDecoder."""
         assert self._counts is not None
-        counts[:] = self._counts[row]
-        for index, values in channels:
-            values[:] = self._values[index][self._starts[row]:self._starts[row + 1]]
+        counts[:] = self._counts[rows.start:rows.stop]
+        begin, end = self._starts[rows.start], self._starts[rows.stop]
+        for channel, values in targets:
+            values[starts[0]:starts[0] + end - begin] = self._values[channel][begin:end]
 
     def close(self) -> None:
         """Release the frame."""

@@ -14,43 +14,45 @@ Bytes = NDArray[np.uint8]
 _MIN_RUN = 3      # A shorter run of equal bytes is cheaper inside a literal.
 _MAX_RUN = 128
 _MAX_LITERAL = 127
-_JUMPS = 6        # Run starts are found 2^6 at a time.
+_DOUBLINGS = 3    # Run starts are found 2^3 at a time.
+
+# How far the next run begins after a count byte, for each value of that byte.
+_STEP = np.array([2] * 128 + [1 + literal for literal in range(128, 0, -1)], np.int32)
 
 
 def decode(packed: Bytes, size: int) -> Bytes:
     """The `size` bytes that `packed` stands for. Raises ValueError when it is cut short or has another size."""
     starts = _run_starts(packed)
-    counts = packed[starts].view(np.int8).astype(np.int64)
-    literal = counts < 0
-    lengths = np.where(literal, -counts, counts + 1)
-    total = int(lengths.sum())
-    last_byte = int(starts[-1] + (lengths[-1] if literal[-1] else 1)) if starts.size else -1
-    if total != size or last_byte != packed.size - 1:
+    counts = packed[starts].view(np.int8).astype(np.int32)
+    runs = counts >= 0
+    if starts.size and starts[-1] + _STEP[packed[starts[-1]]] != packed.size:
+        raise ValueError("the run-length data is cut short")
+    # Count bytes stand for nothing, the byte of a run for several, all others for themselves.
+    repeats = np.ones(packed.size, np.int32)
+    repeats[starts] = 0
+    repeats[starts[runs] + 1] = counts[runs] + 1
+    total = int(repeats.sum(dtype=np.int64))
+    if total != size:
         raise ValueError(f"the run-length data stands for {total} bytes, {size} expected")
-    ends = np.cumsum(lengths)
-    # Source of output byte i: starts + 1, plus its place within the run for a literal.
-    base = np.repeat(starts + 1 - np.where(literal, ends - lengths, 0), lengths)
-    source = base + np.where(np.repeat(literal, lengths), np.arange(size), 0)
-    return packed[source]
+    return np.repeat(packed, repeats)
 
 
-def _run_starts(packed: Bytes) -> NDArray[np.int64]:
-    """Where runs begin. Each byte taken as a count points to the next run; chains of 64 such steps are followed."""
+def _run_starts(packed: Bytes) -> NDArray[np.int32]:
+    """Where runs begin. Each byte, taken for a count, points to the next run; every eighth of these is followed."""
     end = packed.size
-    counts = packed.view(np.int8).astype(np.int64)
-    step = np.arange(end, dtype=np.int64) + np.where(counts < 0, 1 - counts, 2)
-    jumps = [np.append(np.minimum(step, end), end)]
-    for _ in range(_JUMPS):
+    jump = np.full(end + 1, end, np.int32)
+    np.minimum(_STEP[packed] + np.arange(end, dtype=np.int32), end, out=jump[:end])
+    jumps = [jump]
+    for _ in range(_DOUBLINGS):
         jumps.append(jumps[-1][jumps[-1]])
-    heads, far = [], jumps.pop()
-    at = 0
+    far, heads, at = jumps.pop().data, [], 0
     while at < end:
         heads.append(at)
-        at = int(far[at])
-    starts = np.array(heads, np.int64)
+        at = far[at]
+    starts = np.array(heads, np.int32)
     for jump in reversed(jumps):
         starts = np.stack((starts, jump[starts]), axis=1).ravel()
-    return starts[starts < end]
+    return starts[:np.searchsorted(starts, end)]
 
 
 def encode(data: Bytes) -> bytes:
@@ -74,10 +76,12 @@ def encode(data: Bytes) -> bytes:
     run = run[index]
     # One count byte, then one byte of a run or all bytes of a literal.
     stored = np.where(run, 1, lengths)
-    ends = np.cumsum(stored + 1)
-    heads = ends - stored - 1
-    packed = np.empty(int(ends[-1]), np.uint8)
-    source = np.arange(packed.size) + np.repeat(starts - heads - 1, stored + 1)
-    packed[:] = data[np.maximum(source, 0)]
+    heads = np.cumsum(stored + 1) - stored - 1
+    kept = np.repeat(~run, lengths)
+    kept[starts] = True
+    packed = np.empty(heads.size + int(stored.sum()), np.uint8)
+    place = np.ones(packed.size, bool)
+    place[heads] = False
+    packed[place] = data[kept]
     packed[heads] = np.where(run, lengths - 1, -lengths).astype(np.int8).view(np.uint8)
     return packed.tobytes()
