@@ -1,11 +1,87 @@
-"""What a frame is like, measured before it is denoised: exposure and depth scale."""
+"""What a frame is like, measured before it is denoised: exposure, depth scale, live roles, sample counts.
+
+One pass over the file in blocks of rows, so a frame larger than memory is surveyed too.
+"""
 
 from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-EXPOSURE_BIN = 16  # pixels
+from deep_io.path_samples import PathSamples
+
+EXPOSURE_BIN = 16  # pixels along a bin's side
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What one frame holds.
+
+    exposure : 1 / radiance, see `exposure_of`
+    depth : median over the pixels of their hits' mean depth, scene units; 1 without depth or hits
+    varying : roles whose values differ anywhere among the hits; the others are constant over the whole frame
+    pixels, empty_pixels, samples, hits : counts
+    luminance : mean over pixels of the samples' mean radiance
+    repairs : non-finite values that were mended, by role
+    """
+
+    exposure: float
+    depth: float
+    varying: frozenset[str]
+    pixels: int
+    empty_pixels: int
+    samples: int
+    hits: int
+    luminance: float
+    repairs: dict[str, int]
+
+
+def survey(blocks: Iterable[PathSamples]) -> Survey:
+    """Looks at every sample of a frame, given as blocks of whole rows from the top."""
+    bins: dict[int, npt.NDArray[np.float64]] = {}
+    areas: dict[int, npt.NDArray[np.float64]] = {}
+    ranges: dict[str, tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]] = {}
+    depths: list[npt.NDArray[np.float64]] = []
+    repairs: Counter[str] = Counter()
+    pixels = empty = samples = hits = 0
+    total = 0.0
+    top: int | None = None
+    for block in blocks:
+        top = block.window.ymin if top is None else top
+        luminance = _pixel_luminance(block)
+        _add_bins(bins, areas, luminance, block.window.ymin - top)
+        hit = block.coverage > 0
+        for role, values in block.roles.items():
+            live = values[hit]
+            if len(live):
+                low, high = live.min(0), live.max(0)
+                if role in ranges:
+                    low, high = np.minimum(low, ranges[role][0]), np.maximum(high, ranges[role][1])
+                ranges[role] = low, high
+        if "depth" in block.roles:
+            depths.append(pixel_depth(block))
+        repairs.update(block.repairs)
+        pixels += block.counts.size
+        empty += int((block.counts == 0).sum())
+        samples += len(block.weight)
+        hits += int(hit.sum())
+        total += float(luminance.sum())
+    means = np.concatenate([bins[row] / areas[row] for row in sorted(bins)])
+    return Survey(
+        exposure=exposure_of_bins(means),
+        depth=median_depth(depths),
+        varying=frozenset(role for role, (low, high) in ranges.items() if np.any(low != high)),
+        pixels=pixels,
+        empty_pixels=empty,
+        samples=samples,
+        hits=hits,
+        luminance=total / max(pixels, 1),
+        repairs=dict(repairs),
+    )
 
 
 def exposure_of(radiance: npt.NDArray[np.float32]) -> float:
@@ -14,15 +90,63 @@ def exposure_of(radiance: npt.NDArray[np.float32]) -> float:
     Bins are EXPOSURE_BIN pixels square, the last ones smaller; 1 if no bin is positive. Non-finite pixels count as 0.
     """
     luminance = radiance.mean(-1, dtype=np.float64)
-    luminance = np.where(np.isfinite(luminance), luminance, 0)
-    height, width = luminance.shape
-    rows, cols = np.arange(0, height, EXPOSURE_BIN), np.arange(0, width, EXPOSURE_BIN)
-    sums = np.add.reduceat(np.add.reduceat(luminance, rows, 0), cols, 1)
-    areas = np.diff([*rows, height])[:, None] * np.diff([*cols, width])[None, :]
-    return exposure_of_bins(sums / areas)
+    bins: dict[int, npt.NDArray[np.float64]] = {}
+    areas: dict[int, npt.NDArray[np.float64]] = {}
+    _add_bins(bins, areas, np.where(np.isfinite(luminance), luminance, 0), 0)
+    return exposure_of_bins(np.concatenate([bins[row] / areas[row] for row in sorted(bins)]))
 
 
 def exposure_of_bins(means: npt.NDArray[np.float64]) -> float:
     """Exposure from the bins' mean radiance."""
     positive = means[means > 0]
     return float(2.0 ** -np.median(np.log2(positive))) if positive.size else 1.0
+
+
+def _pixel_luminance(block: PathSamples) -> npt.NDArray[np.float64]:
+    """(H, W) weighted mean of the samples' radiance, averaged over R, G, B; 0 without samples."""
+    contribution = block.weight.astype(np.float64) * block.roles["radiance"].mean(1, dtype=np.float64)
+    return _pixel_sums(contribution, block).reshape(block.counts.shape)
+
+
+def pixel_depth(block: PathSamples) -> npt.NDArray[np.float64]:
+    """(M,) mean depth of the hits of each pixel that has hits with a known depth."""
+    depth = block.roles["depth"][:, 0].astype(np.float64)
+    known = (block.coverage > 0) & (depth > 0)
+    counts = _pixel_sums(known.astype(np.float64), block)
+    sums = _pixel_sums(np.where(known, depth, 0), block)
+    return sums[counts > 0] / counts[counts > 0]
+
+
+def median_depth(depths: list[npt.NDArray[np.float64]]) -> float:
+    """The median of blocks of pixel depths; 1 without any."""
+    values = np.concatenate(depths) if depths else np.empty(0)
+    return float(np.median(values)) if values.size else 1.0
+
+
+def _pixel_sums(values: npt.NDArray[np.float64], block: PathSamples) -> npt.NDArray[np.float64]:
+    """(N,) -> (P,): sums over each pixel's samples."""
+    sums = np.zeros(block.counts.size)
+    some = block.counts.reshape(-1) > 0
+    if values.size:
+        sums[some] = np.add.reduceat(values, block.offsets[:-1][some])
+    return sums
+
+
+def _add_bins(
+    bins: dict[int, npt.NDArray[np.float64]],
+    areas: dict[int, npt.NDArray[np.float64]],
+    luminance: npt.NDArray[np.float64],
+    first_row: int,
+) -> None:
+    """Adds rows of luminance, the first of them row `first_row` of the frame, to the sums and areas of their bins."""
+    height, width = luminance.shape
+    cols = np.arange(0, width, EXPOSURE_BIN)
+    sums = np.add.reduceat(luminance, cols, 1)
+    sizes = np.diff([*cols, width]).astype(np.float64)
+    for row in range(height):
+        number = (first_row + row) // EXPOSURE_BIN
+        if number not in bins:
+            bins[number], areas[number] = np.zeros(len(cols)), np.zeros(len(cols))
+        bins[number] += sums[row]
+        areas[number] += sizes
+

@@ -19,7 +19,7 @@ from deep_io.errors import InputError
 from deep_io.flat import read_flat
 from deep_io.path_samples import SampleReader
 from model.samples import ROLE_WIDTHS
-from pipelines.survey import exposure_of
+from pipelines.survey import exposure_of, median_depth, pixel_depth
 
 DEEP_SUFFIX, REFERENCE_SUFFIX = ".deep.exr", ".ref.exr"
 HALF_LIMIT = 60000.0
@@ -126,8 +126,7 @@ def _cache_scene(name: str, deep: Path, reference: Path, folder: Path) -> SceneE
     roles = path_samples.roles
     radiance = roles["radiance"].reshape(height, width, count, 3)
     exposure = exposure_of(radiance.mean(2))
-    hits = roles["depth"][path_samples.coverage > 0] if "depth" in roles else np.ones(1, np.float32)
-    depth = float(np.median(hits)) if hits.size else 1.0
+    depth = median_depth([pixel_depth(path_samples)]) if "depth" in roles else 1.0
     block = np.zeros((height, width, count, CHANNEL_COUNT), np.float16)
     for role, values in {**roles, "coverage": path_samples.coverage[:, None]}.items():
         scaled = values * np.float32({"radiance": exposure, "depth": 1 / depth}.get(role, 1.0))

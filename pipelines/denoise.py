@@ -1,0 +1,262 @@
+"""`lbmc denoise` as a function: frames in, denoised beauties out, each whole or not at all.
+
+Per frame: survey, plan, network, write. The decisions of a sequence (exposure, depth scale, number of layers) are made
+on its first frame and hold for all, so that nothing flickers.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from deep_io import sequences
+from deep_io.atomic import atomic_output, output_action
+from deep_io.errors import InputError, UsageError
+from deep_io.flat import to_half, write_flat
+from deep_io.path_samples import SampleReader
+from model import zoo
+from model.denoiser import Denoiser
+from model.features import FrameScale
+from pipelines import __version__
+from pipelines.inference import FrameLayers, denoise_bands
+from pipelines.jobs import FrameSkippedError, JobReport, run_frames
+from pipelines.options import DenoiseOptions
+from pipelines.progress import Progress, make_progress
+from pipelines.survey import Survey, survey
+from pipelines.tiles import DEFAULT_MEMORY, Band, memory_needed, plan_bands
+
+SURVEY_SHARE = 0.15  # of a frame's progress
+MODEL_ATTRIBUTE, WEIGHTS_ATTRIBUTE, VERSION_ATTRIBUTE = "lbmc:model", "lbmc:weights", "lbmc:version"
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What is decided once for all frames of a job."""
+
+    scale: FrameScale
+    layers: int
+    weighting: str
+
+
+@dataclass(frozen=True)
+class FramePlan:
+    """What will be done with one frame; `lines` say it for a reader."""
+
+    source: Path
+    survey: Survey
+    shot: Shot
+    roles: tuple[str, ...]
+    bands: list[Band]
+    memory: int
+    mapping: list[str]
+
+    def lines(self) -> list[str]:
+        """The plan, for `--dry-run`."""
+        seen = self.survey
+        return [
+            *self.mapping,
+            f"weighting: {self.shot.weighting}",
+            f"samples: {seen.samples} in {seen.pixels} pixels, {seen.empty_pixels} pixels without any",
+            f"roles in use: {', '.join(self.roles)}",
+            f"exposure: {self.shot.scale.exposure:.6g}, depth scale: {self.shot.scale.depth:.6g}",
+            f"layers: {self.shot.layers}",
+            f"bands: {len(self.bands)}, about {self.memory / 2**20:.0f} MiB",
+        ]
+
+
+@dataclass(frozen=True)
+class DenoisedFrame:
+    """What became of one frame. `seconds` are wall seconds by stage: survey, network, write."""
+
+    target: Path | None
+    plan: FramePlan
+    clamped: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+class Job:
+    """The options of a job made concrete: the network on its device, and what the first frame decided."""
+
+    def __init__(self, options: DenoiseOptions) -> None:
+        self.options = options
+        self.weights = find_weights(options.model)
+        self.device = choose_device(options.device)
+        if options.threads is not None:
+            torch.set_num_threads(options.threads)
+        self.net: Denoiser = self.weights.load().to(self.device)
+        self.net.set_product_dtype(product_dtype(options.precision, self.device))
+        self.memory = options.memory or DEFAULT_MEMORY
+        if options.layers is not None and options.layers > self.net.config.partition_logits:
+            raise UsageError(f"--layers {options.layers}: {self.weights.name} has up to "
+                             f"{self.net.config.partition_logits}")
+        self.shot: Shot | None = None
+
+    def open(self, source: Path) -> SampleReader:
+        """Opens an input with the reading options. Refuses what lbmc wrote unless forced."""
+        options = self.options
+        reader = SampleReader(
+            source,
+            part=options.part,
+            overrides=options.overrides,
+            weighting=options.weighting,
+            normals=options.normals,
+            depth=options.depth,
+            camera=options.camera,
+            threads=options.threads,
+        )
+        if MODEL_ATTRIBUTE in reader.header.attributes and not options.force:
+            reader.close()
+            raise InputError(f"{source}: lbmc wrote this file, it is denoised already; pass --force to denoise it again")
+        return reader
+
+    def plan(self, source: Path, reader: SampleReader, update: Callable[[float], None]) -> FramePlan:
+        """Surveys a frame and decides; the first frame decides for the shot."""
+        window = reader.header.data_window
+        rows = 0
+
+        def counted() -> Any:
+            nonlocal rows
+            for block in reader.blocks():
+                rows += block.window.height
+                yield block
+                update(SURVEY_SHARE * rows / window.height)
+
+        seen = survey(counted())
+        if self.shot is None:
+            self.shot = self._decide(seen, reader.weighting)
+        if reader.weighting != self.shot.weighting:
+            raise InputError(f"{source}: weighting {reader.weighting}, but the first frame has {self.shot.weighting}; "
+                             f"pass --weighting for the whole sequence")
+        roles = tuple(role for role in self.net.config.roles if role in reader.mapping)
+        per_pixel = seen.samples / max(seen.pixels, 1)
+        bands = plan_bands(window.height, window.width, per_pixel, self.net.reach, self.net.stride, self.memory)
+        tallest = max(band.read1 - band.read0 for band in bands)
+        needed = memory_needed(tallest, window.width, per_pixel)
+        return FramePlan(source, seen, self.shot, roles, bands, needed, reader.mapping.lines())
+
+    def _decide(self, seen: Survey, weighting: str) -> Shot:
+        options = self.options
+        exposure = options.exposure
+        if exposure is None and options.exposure_from is not None:
+            exposure = self._measured_exposure(options.exposure_from)
+        if exposure is None:
+            exposure = seen.exposure
+        return Shot(FrameScale(exposure, seen.depth), options.layers or self.net.config.layers, weighting)
+
+    def _measured_exposure(self, frame: str) -> float:
+        source = Path(frame)
+        if frame.lstrip("-").isdigit() and not source.exists():
+            source = sequences.frame_path(self.options.source, int(frame))
+        with self.open(source) as reader:
+            return survey(reader.blocks()).exposure
+
+    def frame(self, frame: sequences.Frame, progress: Progress) -> DenoisedFrame:
+        """Denoises one frame. Raises FrameSkippedError, LbmcError."""
+        assert frame.target is not None
+        if not self.options.dry_run and not output_action(frame.target, [frame.source], self.options.existing):
+            raise FrameSkippedError(f"{frame.target} exists")
+        begun = time.perf_counter()
+        with self.open(frame.source) as reader:
+            plan = self.plan(frame.source, reader, progress.update)
+            if self.options.dry_run:
+                for line in plan.lines():
+                    print(line)
+                return DenoisedFrame(None, plan)
+            tell_repairs(frame.source, plan.survey.repairs, progress)
+            surveyed = time.perf_counter()
+            layers = denoise_bands(
+                reader, self.net, plan.shot.scale, plan.roles, plan.shot.layers, plan.bands,
+                lambda done: progress.update(SURVEY_SHARE + (1 - SURVEY_SHARE) * done),
+            )
+            header = reader.header
+        network = time.perf_counter()
+        color, clamped = to_pixel_type(layers.beauty(), self.options.pixel_type)
+        if clamped:
+            progress.note(f"{frame.target}: {clamped} values beyond half's range were clamped; "
+                          f"--pixel-type float keeps them")
+        alpha, _ = to_pixel_type(layers.alpha(), self.options.pixel_type)
+        channels = {name: np.ascontiguousarray(color[..., k]) for k, name in enumerate("RGB")}
+        channels["A"] = alpha
+        with atomic_output(frame.target) as temporary:
+            write_flat(temporary, channels, header, self.options.compression, self.provenance())
+        seconds = {"survey": surveyed - begun, "network": network - surveyed,
+                   "write": time.perf_counter() - network}
+        return DenoisedFrame(frame.target, plan, clamped, seconds)
+
+    def provenance(self) -> dict[str, str]:
+        """Header attributes that say what made a file; no times, so that the same input gives the same bytes."""
+        return {
+            VERSION_ATTRIBUTE: __version__,
+            MODEL_ATTRIBUTE: self.weights.name,
+            WEIGHTS_ATTRIBUTE: self.weights.digest,
+        }
+
+
+def denoise_frames(options: DenoiseOptions) -> JobReport[DenoisedFrame]:
+    """Denoises a file or a sequence; failed frames do not stop the others.
+
+    Raises InputError or UsageError for what concerns the whole job, before any frame is touched.
+    """
+    frames = sequences.pair(options.source, options.target, options.frames)
+    if not options.dry_run:
+        for frame in frames:  # a refused output is found before hours of work, not after
+            assert frame.target is not None
+            output_action(frame.target, [other.source for other in frames], options.existing)
+    job = Job(options)
+    progress = make_progress(options.progress, len(frames))
+    with progress:
+        return run_frames(frames, job.frame, progress, str)
+
+
+def denoise_file(source: str | os.PathLike[str], options: DenoiseOptions) -> FrameLayers:
+    """The layers of one file in memory, for other pipelines and for scripts; nothing is written."""
+    job = Job(replace(options, source=os.fspath(source)))
+    with job.open(Path(source)) as reader:
+        plan = job.plan(Path(source), reader, lambda _: None)
+        return denoise_bands(reader, job.net, plan.shot.scale, plan.roles, plan.shot.layers, plan.bands)
+
+
+def find_weights(name: str | None) -> zoo.Weights:
+    """A preset or weight file. Raises UsageError."""
+    try:
+        return zoo.find(name)
+    except ValueError as error:
+        raise UsageError(f"--model: {error}") from None
+
+
+def choose_device(name: str) -> torch.device:
+    """auto: the first GPU if there is one. Raises UsageError where CUDA is asked for and absent."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = torch.device(name)
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise UsageError(f"--device {name}: this machine shows {torch.cuda.device_count()} CUDA devices to PyTorch; "
+                         f"pass --device cpu, or install a CUDA build of torch")
+    return device
+
+
+def product_dtype(precision: str, device: torch.device) -> torch.dtype | None:
+    """The type of matrix products; None is float32. `auto`: bf16 on a GPU, float32 on a CPU."""
+    if precision == "auto":
+        return torch.bfloat16 if device.type == "cuda" else None
+    return {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}[precision]
+
+
+def to_pixel_type(values: npt.NDArray[np.float32], pixel_type: str) -> tuple[npt.NDArray[Any], int]:
+    """Values in the type to be written, and how many were clamped to half's range."""
+    return (values, 0) if pixel_type == "float" else to_half(values)
+
+
+def tell_repairs(source: Path, repairs: dict[str, int], progress: Progress) -> None:
+    """One line on what was not finite in the input."""
+    if repairs:
+        listed = ", ".join(f"{count} {role}" for role, count in sorted(repairs.items()))
+        progress.note(f"{source}: non-finite values were left out: {listed}")

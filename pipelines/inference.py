@@ -1,0 +1,89 @@
+"""One frame through a network: path samples to the model's tensors, band by band, and layers back to arrays.
+
+The only place where deep_io's arrays become the model's tensors. Which files, and what is written, is denoise.py's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from deep_io.path_samples import PathSamples, SampleReader
+from model.denoiser import Denoiser
+from model.features import FrameScale
+from model.samples import Samples
+from pipelines.tiles import Band
+
+FloatArray = npt.NDArray[np.float32]
+
+
+@dataclass
+class FrameLayers:
+    """A denoised frame's layers, float32, front layer first: see `model.compositing.Layers`.
+
+    color (L, 3, H, W), weight (L, H, W), coverage (L, H, W), depth (L, H, W), inf where a layer has no hit
+    """
+
+    color: FloatArray
+    weight: FloatArray
+    coverage: FloatArray
+    depth: FloatArray
+
+    def beauty(self) -> FloatArray:
+        """(H, W, 3) radiance."""
+        return np.moveaxis(self.color.sum(0), 0, -1)
+
+    def alpha(self) -> FloatArray:
+        """(H, W) coverage, 0..1."""
+        return np.clip(self.coverage.sum(0), 0, 1)
+
+
+def to_model(block: PathSamples, roles: tuple[str, ...], device: torch.device) -> Samples:
+    """A block of decoded samples as the model's input, with those of the roles that the block has."""
+    height, width = block.counts.shape
+
+    def tensor(array: npt.NDArray[np.generic]) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(device)
+
+    return Samples(
+        shape=(1, height, width),
+        counts=tensor(block.counts.reshape(-1)),
+        weight=tensor(block.weight),
+        coverage=tensor(block.coverage),
+        roles={role: tensor(values) for role, values in block.roles.items() if role in roles},
+    )
+
+
+@torch.inference_mode()
+def denoise_bands(
+    reader: SampleReader,
+    net: Denoiser,
+    scale: FrameScale,
+    roles: tuple[str, ...],
+    layers: int,
+    bands: list[Band],
+    update: Callable[[float], None] = lambda _: None,
+) -> FrameLayers:
+    """Denoises a frame band by band; the bands' halos make the result independent of the cuts."""
+    window = reader.header.data_window
+    device = next(net.parameters()).device
+    shape = (layers, window.height, window.width)
+    out = FrameLayers(
+        np.empty((layers, 3, *shape[1:]), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32),
+        np.empty(shape, np.float32),
+    )
+    for number, band in enumerate(bands):
+        block = reader.read(window.ymin + band.read0, window.ymin + band.read1)
+        samples = to_model(block, roles, device)
+        del block
+        result = net(samples, scale, layers)
+        rows = slice(band.y0 - band.read0, band.y1 - band.read0)
+        for mine, theirs in ((out.color, result.color), (out.weight, result.weight), (out.coverage, result.coverage),
+                             (out.depth, result.depth)):
+            mine[..., band.y0 : band.y1, :] = theirs[0, ..., rows, :].float().cpu().numpy()
+        update((number + 1) / len(bands))
+    return out

@@ -1,0 +1,46 @@
+"""Bands: how a frame is cut into full-width strips so that a job stays within its memory budget.
+
+A band is read with a halo as wide as the network's reach and starts on the network's grid, so that where the cuts lie
+changes nothing in the result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+BYTES_PER_SAMPLE = 160  # decoded roles in float32, and what the network holds per sample
+BYTES_PER_PIXEL = 3600  # planes, predictions and context of two layers at their peak
+BYTES_BASE = 500 << 20  # the process with its libraries
+DEFAULT_MEMORY = 4 << 30
+
+
+@dataclass(frozen=True)
+class Band:
+    """Rows y0..y1 (exclusive) of the result, made from rows read0..read1; all count from the frame's first row."""
+
+    y0: int
+    y1: int
+    read0: int
+    read1: int
+
+
+def memory_needed(rows: int, width: int, samples_per_pixel: float) -> int:
+    """Estimated peak bytes of denoising so many full rows at once."""
+    return BYTES_BASE + round(rows * width * (BYTES_PER_PIXEL + BYTES_PER_SAMPLE * samples_per_pixel))
+
+
+def plan_bands(height: int, width: int, samples_per_pixel: float, reach: int, stride: int, memory: int) -> list[Band]:
+    """The fewest equal bands that fit the budget; where none fits, bands of one stride, the smallest there are."""
+    for count in range(1, -(-height // stride) + 1):
+        rows = -(-height // count)
+        rows = -(-rows // stride) * stride
+        bands = [_band(y, min(y + rows, height), height, reach, stride) for y in range(0, height, rows)]
+        tallest = max(band.read1 - band.read0 for band in bands)
+        if memory_needed(tallest, width, samples_per_pixel) <= memory:
+            return bands
+    return bands
+
+
+def _band(y0: int, y1: int, height: int, reach: int, stride: int) -> Band:
+    read0 = max(y0 - reach, 0) // stride * stride
+    return Band(y0, y1, read0, min(y1 + reach, height))
