@@ -114,7 +114,7 @@ class Job:
         )
         if MODEL_ATTRIBUTE in reader.header.attributes and not options.force:
             reader.close()
-            raise InputError(f"{source}: lbmc wrote this file, it is denoised already; pass --force to denoise it again")
+            raise InputError(f"{source}: written by lbmc, so denoised already; pass --force to denoise it again")
         return reader
 
     def plan(self, source: Path, reader: SampleReader, update: Callable[[float], None]) -> FramePlan:

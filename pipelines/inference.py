@@ -35,11 +35,13 @@ class FrameLayers:
 
     def beauty(self) -> FloatArray:
         """(H, W, 3) radiance."""
-        return np.moveaxis(self.color.sum(0), 0, -1)
+        beauty: FloatArray = np.moveaxis(self.color.sum(0), 0, -1)
+        return beauty
 
     def alpha(self) -> FloatArray:
         """(H, W) coverage, 0..1."""
-        return np.clip(self.coverage.sum(0), 0, 1)
+        alpha: FloatArray = np.clip(self.coverage.sum(0), 0, 1)
+        return alpha
 
 
 def to_model(block: PathSamples, roles: tuple[str, ...], device: torch.device) -> Samples:

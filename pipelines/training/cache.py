@@ -91,7 +91,7 @@ def build_cache(source: Path, folder: Path, report: Callable[[str], None] = lamb
         data = json.loads(index.read_text())
         if data.get("version") == CACHE_VERSION:
             known = {entry["name"]: entry for entry in data["scenes"]}
-    scenes = []
+    scenes: list[dict[str, object]] = []
     for name, deep, reference in scene_files(source):
         if name not in known:
             known[name] = asdict(_cache_scene(name, deep, reference, folder))
