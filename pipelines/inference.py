@@ -13,6 +13,7 @@ import numpy.typing as npt
 import torch
 
 from deep_io.path_samples import PathSamples, SampleReader
+from model.compositing import Layers, fill_holes
 from model.denoiser import Denoiser
 from model.features import FrameScale
 from model.samples import Samples
@@ -73,19 +74,22 @@ def denoise_bands(
     """Denoises a frame band by band; the bands' halos make the result independent of the cuts."""
     window = reader.header.data_window
     device = next(net.parameters()).device
-    shape = (layers, window.height, window.width)
-    out = FrameLayers(
-        np.empty((layers, 3, *shape[1:]), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32),
-        np.empty(shape, np.float32),
+    size = (window.height, window.width)
+    frame = Layers(
+        color=torch.empty(1, layers, 3, *size),
+        weight=torch.empty(1, layers, *size),
+        coverage=torch.empty(1, layers, *size),
+        depth=torch.empty(1, layers, *size),
     )
     for number, band in enumerate(bands):
-        block = reader.read(window.ymin + band.read0, window.ymin + band.read1)
-        samples = to_model(block, roles, device)
-        del block
-        result = net(samples, scale, layers)
+        samples = to_model(reader.read(window.ymin + band.read0, window.ymin + band.read1), roles, device)
+        result = net(samples, scale, layers, fill=False)
         rows = slice(band.y0 - band.read0, band.y1 - band.read0)
-        for mine, theirs in ((out.color, result.color), (out.weight, result.weight), (out.coverage, result.coverage),
-                             (out.depth, result.depth)):
-            mine[..., band.y0 : band.y1, :] = theirs[0, ..., rows, :].float().cpu().numpy()
+        for whole, part in zip(_planes(frame), _planes(result), strict=True):
+            whole[..., band.y0 : band.y1, :] = part[..., rows, :].cpu()
         update((number + 1) / len(bands))
-    return out
+    return FrameLayers(*(plane[0].numpy() for plane in _planes(fill_holes(frame))))
+
+
+def _planes(layers: Layers) -> tuple[torch.Tensor, ...]:
+    return layers.color, layers.weight, layers.coverage, layers.depth
