@@ -24,9 +24,9 @@ from lbmc_cli.report import end_job
 @option("--heatmap", "heat_map", metavar="PNG", help="Write the signed relative error as a picture with its scale.")
 @option("--panel", metavar="PNG", help="Write image, reference, error and crops of the worst regions.")
 @option("--overwrite", is_flag=True, help="Replace pictures that exist.")
-@option("--no-flip", "flip", is_flag=True, flag_value=False, default=True, help="Leave FLIP out, the slowest metric.")
+@option("--no-flip", is_flag=True, help="Leave FLIP out, the slowest metric.")
 @PROGRESS
-def compare(as_json: bool, **choices: Any) -> int:
+def compare(as_json: bool, no_flip: bool, **choices: Any) -> int:
     """Measure IMAGE against REFERENCE, two flat EXRs in linear light.
 
     All metrics but the energy are taken after one common scale, 0.5 / mean(min(reference, its 99th percentile)). Both
@@ -34,7 +34,7 @@ def compare(as_json: bool, **choices: Any) -> int:
     """
     from pipelines.compare import CompareOptions, compare_frames, comparison_as_dict, comparison_lines
 
-    report = compare_frames(CompareOptions(**choices))
+    report = compare_frames(CompareOptions(flip=not no_flip, **choices))
     if as_json:
         click.echo(json.dumps(comparison_as_dict(report.values), indent=2))
     elif report.values:

@@ -46,10 +46,7 @@ def _layers(ctx: click.Context, parameter: click.Parameter, value: str) -> int |
 )
 @option(
     "--no-adapt",
-    "adapt",
     is_flag=True,
-    flag_value=False,
-    default=True,
     help="Model everything, also what the survey finds the scene does not need.",
 )
 @option(
@@ -94,7 +91,7 @@ def _layers(ctx: click.Context, parameter: click.Parameter, value: str) -> int |
 )
 @option("--dry-run", is_flag=True, help="Show frames, mapping, decisions, tile plan and memory; write nothing.")
 @PROGRESS
-def denoise(overwrite: bool, skip_existing: bool, part: str | None, **choices: Any) -> int:
+def denoise(overwrite: bool, skip_existing: bool, part: str | None, no_adapt: bool, **choices: Any) -> int:
     """Denoise IN, a deep EXR whose samples are path samples, to the flat EXR OUT.
 
     IN and OUT may be sequences: shot.####.exr, shot.%04d.exr, shot.$F4.exr. Exit codes: 0 done, 1 some frames failed,
@@ -104,6 +101,7 @@ def denoise(overwrite: bool, skip_existing: bool, part: str | None, **choices: A
         DenoiseOptions,
         existing=existing_choice(overwrite, skip_existing),
         part=part_choice(part),
+        adapt=not no_adapt,
         **choices,
     )
     from pipelines.denoise import denoise_frames

@@ -41,18 +41,16 @@ def _note_debug(ctx: click.Context, parameter: click.Parameter | None, value: bo
 
 
 class LbmcOption(click.Option):
-    """An option whose default may come from LBMC_<COMMAND>_<OPTION> or, for all commands at once, LBMC_<OPTION>."""
+    """An option that LBMC_<COMMAND>_<OPTION>, or LBMC_<OPTION> for all commands at once, can stand in for.
+
+    The name is the flag's own: LBMC_NO_ADAPT=1 for --no-adapt.
+    """
 
     def resolve_envvar_value(self, ctx: click.Context) -> str | None:
-        value = super().resolve_envvar_value(ctx)
-        if value is None and self.name is not None:
-            root = ctx.find_root().auto_envvar_prefix
-            value = _environment(f"{root}_{self.name.upper()}") if root else None
-        return value
-
-
-def _environment(name: str) -> str | None:
-    return os.environ.get(name) or None
+        flag = max(self.opts, key=len).lstrip("-").replace("-", "_").upper()
+        contexts = (ctx, ctx.find_root())
+        names = (f"{context.auto_envvar_prefix}_{flag}" for context in contexts if context.auto_envvar_prefix)
+        return next((os.environ[name] for name in names if os.environ.get(name)), None)
 
 
 option: Callable[..., Callable[[Any], Any]] = partial(click.option, cls=LbmcOption)

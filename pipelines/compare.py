@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenEXR
 from numpy.typing import NDArray
 
 from deep_io.atomic import atomic_output, output_action
 from deep_io.errors import InputError, UsageError
-from deep_io.header import read_headers
+from deep_io.flat import read_flat
 from deep_io.samples import Window
 from deep_io.sequences import Frame, expand, frame_path, is_sequence
 from model.metrics import Scores, geometric_mean, score
@@ -174,16 +173,11 @@ def read_rgb(path: PathLike) -> FlatPicture:
 
     Raises InputError for a file that is missing, not an EXR, deep, or without R, G, B.
     """
-    where = os.fspath(path)
-    headers = read_headers(where)
-    for number, header in enumerate(headers):
-        if {"R", "G", "B"} <= set(header.channel_names):
-            if header.is_deep:
-                raise InputError(f"{where}: is deep; compare what denoise made of it, a flat EXR")
-            channels = OpenEXR.File(where, separate_channels=True).parts[number].channels
-            rgb = np.stack([channels[name].pixels for name in "RGB"], axis=-1)
-            return FlatPicture(where, rgb, header.data_window)
-    raise InputError(f"{where}: no R, G, B channels (its channels: {', '.join(headers[0].channel_names)})")
+    flat = read_flat(path)
+    if not {"R", "G", "B"} <= set(flat.channels):
+        raise InputError(f"{os.fspath(path)}: no R, G, B channels (its channels: {', '.join(flat.channels)})")
+    rgb = np.stack([flat.channels[name].astype(np.float32) for name in "RGB"], axis=-1)
+    return FlatPicture(os.fspath(path), rgb, flat.window)
 
 
 def mean_scores(rows: Sequence[Scores]) -> dict[str, float | None]:

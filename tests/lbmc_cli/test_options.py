@@ -83,6 +83,8 @@ def test_environment_variables_stand_in_for_flags(parsed: Any) -> None:
     assert parsed(env={"LBMC_THREADS": "2", "LBMC_DENOISE_THREADS": "3"}).threads == 3
     assert parsed("--threads", "4", env={"LBMC_DENOISE_THREADS": "3"}).threads == 4
     assert parsed(env={"LBMC_OVERWRITE": "1"}).existing == "overwrite"
+    assert not parsed(env={"LBMC_NO_ADAPT": "1"}).adapt
+    assert parsed(env={"LBMC_NO_ADAPT": "0"}).adapt
     assert parsed(env={"LBMC_MAP": "normal=Nw depth=Zc"}).overrides == {"normal": "Nw", "depth": "Zc"}
 
 

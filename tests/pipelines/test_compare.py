@@ -74,7 +74,7 @@ def test_a_file_without_colour_is_refused(tmp_path: Path) -> None:
 def test_a_deep_file_is_refused(tmp_path: Path) -> None:
     channels: dict[str, np.ndarray] = {name: np.ones(1, np.float16) for name in "RGB"}
     write_deep(tmp_path / "a.exr", DeepSamples(np.ones((1, 1), np.int32), channels, Window(0, 0, 0, 0)))
-    with pytest.raises(InputError, match="a.exr: is deep"):
+    with pytest.raises(InputError, match="a.exr: is a deep EXR"):
         compare(tmp_path / "a.exr", tmp_path / "a.exr")
 
 
