@@ -31,6 +31,7 @@ MAX_RATIO = {"none": 1, "rle": 64, "zips": 1032, "zstd": 32768}
 _SCAN_MIN_BYTES = 16384
 # The doubling scan's row: a power of two so that a line has 16 to 32 rows, where passes and row steps balance.
 _SCAN_ROWS = 16
+_SCRATCH_MAX_BYTES = 16 << 20
 
 _scratch = threading.local()
 
@@ -110,7 +111,12 @@ def _undo_differences(raw: Bytes) -> Bytes:
 
 
 def _buffer(name: str, size: int, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Scratch memory of this thread: fresh pages would cost more than the arithmetic on them."""
+    """Scratch memory of this thread: fresh pages would cost more than the arithmetic on them.
+
+    Not kept for a line of unusual size, or a single one would hold on to its memory for good.
+    """
+    if size * dtype.itemsize > _SCRATCH_MAX_BYTES:
+        return np.empty(size, dtype)
     held: NDArray[Any] | None = getattr(_scratch, name, None)
     if held is None or held.size < size:
         held = np.empty(size, dtype)

@@ -26,6 +26,43 @@ def test_blocks_make_the_same_file_as_the_whole(tmp_path, line_order, rows):
     assert read_headers(tmp_path / "whole.exr")[0].line_order == line_order
 
 
+def test_parts_are_written_side_by_side_and_read_by_all(tmp_path):
+    path = tmp_path / "parts.exr"
+    parts = [random_samples(1, smooth=True), random_samples(2, Window(0, 0, 4, 4), channels={"G": np.float32})]
+    parts[1].channels["G"][:] = np.arange(parts[1].total)
+    headers = [replace(Header.of_samples(samples, parts[0].window), name=name, line_order=order)
+               for samples, name, order in zip(parts, ("left", "right"), ("increasing", "decreasing"), strict=True)]
+    with DeepWriter(path, headers) as writer:
+        first, second = split_rows(parts[0], 5)
+        writer.write(first)
+        writer.write(parts[1], part=1)
+        writer.write(second)
+    assert [header.name for header in read_headers(path)] == ["left", "right"]
+    for index, samples in enumerate(parts):
+        assert_same(read_deep(path, index)[0], samples)
+        assert_same(read_openexr(path, index), samples)
+        assert_same(read_oiio(path, index), samples)
+
+
+def test_parts_need_names_and_one_display_window(tmp_path):
+    header = Header.of_samples(random_samples())
+    for headers, message in (([header, header], "need names"), ([], "need names"), (
+            [replace(header, name="a"), replace(header, name="b", display_window=Window(0, 0, 1, 1))], "share one")):
+        with pytest.raises(ValueError, match=message):
+            DeepWriter(tmp_path / "a.exr", headers)
+    assert not (tmp_path / "a.exr").exists()
+
+
+def test_a_single_part_in_a_multi_part_file_needs_all_rows_too(tmp_path):
+    samples = random_samples()
+    header = replace(Header.of_samples(samples), name="only")
+    with DeepWriter(tmp_path / "a.exr", [header]) as writer:
+        writer.write(samples)
+    assert_same(read_deep(tmp_path / "a.exr", "only")[0], samples)
+    with pytest.raises(ValueError, match="0 of 10 rows"):
+        DeepWriter(tmp_path / "b.exr", [header]).close()
+
+
 def test_structure_is_the_files_own_and_the_rest_is_kept(tmp_path):
     samples = random_samples()
     header = Header.of_samples(samples, Window(0, 0, 99, 99), {"owner": "me"})
