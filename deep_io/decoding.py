@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_io.camera import Camera
-from deep_io.conventions import Conventions, resolve
+from deep_io.conventions import DEPTH_ATTRIBUTE, Conventions, resolve
 from deep_io.csr import Index, offsets_of, pixels_of
 from deep_io.errors import InputError, UsageError
 from deep_io.header import Header
@@ -89,6 +89,8 @@ def interpretation(header: Header, path: str, overrides: Mapping[str, str] | Non
     """How the samples under a header are to be read; parameters and errors as for path_samples.SampleReader."""
     if weighting is not None and weighting not in WEIGHTINGS:
         raise UsageError(f"--weighting {weighting}: must be one of {', '.join(WEIGHTINGS)}")
+    if header.get(DEPTH_ATTRIBUTE) == "none":
+        overrides = {"depth": "none", **(overrides or {})}  # Z orders the samples and measures nothing
     mapping = map_roles(header.channel_names, overrides, attributes=header.attributes,
                         dtypes={channel.name: channel.dtype for channel in header.channels}, source=path)
     stated = header.get(ATTRIBUTE)

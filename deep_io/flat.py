@@ -10,6 +10,7 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from deep_io.header import (
     LONG_NAMES,
     MAGIC,
     MULTI_PART,
+    FileHeaders,
     Header,
     channels_of,
     encode_header,
@@ -123,10 +125,13 @@ def read_flat_parts(path: PathLike) -> list[FlatImage]:
     if any(channel.sampling != (1, 1) for header in headers for channel in header.channels):
         raise InputError(f"{name}: has subsampled channels; convert it to full resolution")
     try:
-        # Corrupt pixels are a warning to the library; the parts are then missing or empty, and checked below.
-        with warnings.catch_warnings(), OpenEXR.File(name, separate_channels=True) as file:
-            warnings.simplefilter("ignore")
-            parts = [{key: channel.pixels for key, channel in part.channels.items()} for part in file.parts]
+        try:
+            parts = _library_parts(name)
+        except RuntimeError as error:
+            # The library gives up on a whole file for one attribute of a type that its Python side does not know.
+            if "unsupported attribute type" not in str(error):
+                raise
+            parts = _library_parts(_without_attributes(path))
     except (RuntimeError, OSError, ValueError) as error:
         raise InputError(f"{name}: cannot be read: {' '.join(str(error).split())}") from error
     if len(parts) != len(headers):
@@ -182,26 +187,50 @@ def _library_header(header: Header, compression: str) -> dict[str, Any]:
             "pixelAspectRatio": float(header.pixel_aspect)}
 
 
+def _library_parts(file: str | BytesIO) -> list[dict[str, Pixels]]:
+    """The channels of every part. Corrupt pixels are a mere warning to the library: parts are then missing or empty."""
+    with warnings.catch_warnings(), OpenEXR.File(file, separate_channels=True) as opened:
+        warnings.simplefilter("ignore")
+        return [{key: channel.pixels for key, channel in part.channels.items()} for part in opened.parts]
+
+
+def _without_attributes(path: PathLike) -> BytesIO:
+    """The file in memory, with none but the attributes that an EXR must have."""
+    with open(path, "rb") as file:
+        written = parse_headers(file, os.fspath(path))
+        file.seek(0)
+        return BytesIO(_with_headers(file.read(), written, [replace(part, attributes={}) for part in written.parts]))
+
+
 def _set_attributes(path: PathLike, images: Sequence[FlatImage]) -> None:
-    """Replace the headers of a finished file by ones with all attributes, and move the chunk offsets along."""
+    """Give the headers of a finished file all the attributes of `images`."""
     with open(path, "r+b") as file:
         written = parse_headers(file, os.fspath(path))
         headers = [replace(mine, attributes={**mine.attributes, **image.header.attributes})
                    for mine, image in zip(written.parts, images, strict=True)]
-        file.seek(written.end)
-        chunks = sum(_chunk_count(header) for header in headers)
-        offsets = np.frombuffer(file.read(8 * chunks), "<u8")
-        pixels = file.read()
-        flags = written.flags | (LONG_NAMES if any(map(needs_long_names, headers)) else 0)
-        start = np.array([MAGIC, flags & ~0xFF | FORMAT_VERSION], "<u4").tobytes()
-        encoded = b"".join([start, *map(encode_header, headers), b"\0" if written.flags & MULTI_PART else b""])
         file.seek(0)
-        file.write(encoded)
-        # Unsigned arithmetic wraps around, so a header that got shorter is fine too.
-        file.write((offsets + np.uint64((len(encoded) - written.end) % 2**64)).astype("<u8").tobytes())
-        file.write(pixels)
+        whole = _with_headers(file.read(), written, headers)
+        file.seek(0)
+        file.write(whole)
         file.truncate()
 
 
+def _with_headers(whole: bytes, written: FileHeaders, headers: Sequence[Header]) -> bytes:
+    """A flat file with other attributes in its headers, and its chunk offsets moved along."""
+    table_end = written.end + 8 * sum(map(_chunk_count, headers))
+    offsets = np.frombuffer(whole[written.end:table_end], "<u8")
+    flags = written.flags | (LONG_NAMES if any(map(needs_long_names, headers)) else 0)
+    start = np.array([MAGIC, flags & ~0xFF | FORMAT_VERSION], "<u4").tobytes()
+    encoded = b"".join([start, *map(encode_header, headers), b"\0" if written.flags & MULTI_PART else b""])
+    # Unsigned arithmetic wraps around, so a header that got shorter is fine too.
+    moved = offsets + np.uint64((len(encoded) - written.end) % 2**64)
+    return b"".join([encoded, moved.astype("<u8").tobytes(), whole[table_end:]])
+
+
 def _chunk_count(header: Header) -> int:
+    stated = header.structure.get("chunkCount")
+    if stated is not None:
+        return int(stated.value)
+    if header.type != "scanlineimage" or header.compression not in _ROWS_PER_CHUNK:
+        raise ValueError(f"a {header.type} with {header.compression} compression and no chunkCount")
     return -(-header.data_window.height // _ROWS_PER_CHUNK[header.compression])

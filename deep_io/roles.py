@@ -108,6 +108,11 @@ class RoleMap:
         return self.sources[role]
 
     @property
+    def roles(self) -> tuple[str, ...]:
+        """The roles found, in the order of ROLES."""
+        return tuple(self.sources)
+
+    @property
     def channels(self) -> tuple[str, ...]:
         """Every channel that has to be read, each once."""
         return tuple(dict.fromkeys(name for source in self.sources.values() for name in source.channels))

@@ -35,9 +35,14 @@ class Frame:
         return self.source.name
 
 
+def has_pattern(path: PathLike) -> bool:
+    """Whether the name holds a frame pattern, whatever exists on disk."""
+    return _PATTERN.search(Path(path).name) is not None
+
+
 def is_sequence(path: PathLike) -> bool:
-    """Whether the name holds a frame pattern. A file that exists under exactly this name is a single file."""
-    return _PATTERN.search(Path(path).name) is not None and not os.path.exists(path)
+    """Whether an input's name holds a frame pattern and no file of exactly this name exists."""
+    return has_pattern(path) and not os.path.exists(path)
 
 
 def parse_frames(text: str) -> list[int]:
@@ -91,7 +96,7 @@ def pair(source: PathLike, target: PathLike, frames: str | None = None) -> list[
     """
     many = is_sequence(source)
     # An output of this very name may exist from a mistaken run; the pattern still says what is meant.
-    many_out = _PATTERN.search(Path(target).name) is not None
+    many_out = has_pattern(target)
     if many and not many_out:
         raise InputError(f"{os.fspath(target)}: IN is a sequence ({os.fspath(source)}) but OUT is a single file; "
                          f"write the frame number into OUT as well, such as {Path(target).stem}.####.exr")

@@ -88,6 +88,16 @@ def test_windows_aspect_and_user_attributes_are_kept_byte_for_byte_and_the_other
         assert file.header()["owner"] == source.get("owner")
 
 
+def test_an_attribute_that_the_library_does_not_know_is_no_obstacle(tmp_path):
+    path = tmp_path / "flat.exr"
+    write_flat(path, picture(), attributes={"state": Attribute("deepImageState", b"\1"), "owner": "me"})
+    with pytest.raises(RuntimeError, match="deepImageState"):
+        OpenEXR.File(str(path), separate_channels=True)
+    image = read_flat(path)
+    assert_same(picture(), image.channels)
+    assert image.header.get("owner") == "me"
+
+
 def test_parts_read_back_with_their_names_and_attributes(tmp_path):
     path = tmp_path / "parts.exr"
     images = [FlatImage.of(picture(index), header_of_input(), name=f"part{index}", attributes={"index": index})
