@@ -19,7 +19,7 @@ from deep_io.header import FileHeaders
 from deep_io.rows import Targets
 
 # What the library holds per pixel and channel besides the values: a NumPy array object and its reference, measured.
-_OBJECT_BYTES = 250
+_OBJECT_BYTES = 210
 # The library's own frame, the arrays made of it and the flat arrays.
 _VALUE_COPIES = 3
 

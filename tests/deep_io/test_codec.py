@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deep_io import codec, rle
+from tests.deep_io.deep_files import seeded
 
 COMPRESSIONS = st.sampled_from(codec.COMPRESSIONS)
 RUNS = st.lists(st.tuples(st.integers(0, 255), st.integers(1, 300)), max_size=40)
@@ -37,6 +38,7 @@ def smooth(size: int) -> np.ndarray:
     return (1000 * np.sin(np.arange(size) / 50)).astype(np.int16).view(np.uint16)
 
 
+@seeded
 @given(st.binary(max_size=400).filter(lambda data: len(data) % 2 == 0), COMPRESSIONS)
 def test_every_line_survives_the_round_trip(data, compression):
     packed = codec.encode(np.frombuffer(data, np.uint16), compression)
@@ -63,6 +65,7 @@ def test_incompressible_data_is_stored_raw():
     assert codec.encode(line, "zips") == codec.encode(line, "rle") == line.tobytes()
 
 
+@seeded
 @given(RUNS)
 def test_rle_says_what_the_format_says(runs):
     data = b"".join(bytes([value]) * length for value, length in runs) or b"x"
@@ -71,6 +74,7 @@ def test_rle_says_what_the_format_says(runs):
     assert rle.decode(np.frombuffer(packed, np.uint8), len(data)).tobytes() == data
 
 
+@seeded
 @given(st.binary(max_size=300), st.integers(0, 2000))
 def test_rle_of_anything_is_decoded_exactly_or_refused(packed, size):
     try:

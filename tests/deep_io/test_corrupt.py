@@ -8,12 +8,12 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deep_io import DeepReader, Header, InputError, MemoryCostWarning, Window, read_deep, write_deep
 from deep_io.header import encode_header, parse_headers
-from tests.deep_io.deep_files import openexr_part, random_samples, write_openexr
+from tests.deep_io.deep_files import openexr_part, random_samples, seeded, write_openexr
 
 LEADER = struct.Struct("<i3Q")
 ROWS = 10
@@ -116,7 +116,7 @@ def test_every_truncation_is_an_input_error(damaged):
         damaged.refused("")
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(seeded, max_examples=300)
 @given(st.data())
 def test_any_changed_bytes_are_refused_or_read_within_bounds(damaged, data):
     changed = bytearray(damaged.data)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from deep_io import Channel, Header, InputError, Window, read_deep, read_headers, write_deep
 from deep_io.attributes import Attribute, attribute
 from deep_io.header import channels_of, encode_header, needs_long_names, parse_headers
-from tests.deep_io.deep_files import openexr_part, random_samples, write_openexr
+from tests.deep_io.deep_files import openexr_part, random_samples, seeded, write_openexr
 
 STANDARD = {
     "aString": "a text with ünïcode", "anInt": -5, "aFloat": 0.25, "names": ["left", "right eye", ""],
@@ -52,6 +52,7 @@ def test_values_without_an_exr_type_are_refused(value):
         attribute(value)
 
 
+@seeded
 @given(st.binary(max_size=80), st.sampled_from(["string", "stringvector", "m44f", "v2i", "floatvector", "mystery"]))
 def test_reading_a_value_never_fails(data, kind):
     assert Attribute(kind, data).value is not None
@@ -190,6 +191,7 @@ def test_every_truncation_of_a_header_is_an_input_error(tmp_path):
             read_headers(path)
 
 
+@seeded
 @given(st.binary(min_size=0, max_size=300))
 def test_random_bytes_after_the_magic_are_an_input_error_or_a_header(tmp_path_factory, data):
     path = tmp_path_factory.getbasetemp() / "random.exr"

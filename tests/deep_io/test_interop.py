@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deep_io import DeepSamples, Header, MemoryCostWarning, Window, read_deep, write_deep
@@ -15,6 +15,7 @@ from tests.deep_io.deep_files import (
     random_samples,
     read_oiio,
     read_openexr,
+    seeded,
     values_of,
     write_oiio,
     write_openexr,
@@ -22,7 +23,7 @@ from tests.deep_io.deep_files import (
 
 DTYPES = st.sampled_from([np.float16, np.float32, np.uint32])
 NAMES = st.text("abcXYZ.019_ é", min_size=1, max_size=60).filter(lambda name: len(name.encode()) < 200)
-QUICK = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+QUICK = settings(seeded, max_examples=60)
 
 
 @st.composite

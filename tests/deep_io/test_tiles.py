@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deep_io import DeepReader, InputError, Window, read_deep
 from deep_io.attributes import attribute
 from deep_io.header import encode_header, parse_headers
 from deep_io.samples import concatenate
-from tests.deep_io.deep_files import assert_same, openexr_part, random_samples, split_rows, write_openexr
+from tests.deep_io.deep_files import assert_same, openexr_part, random_samples, seeded, split_rows, write_openexr
 
 TILE = (16, 8)
 LEADER = struct.Struct("<4i3Q")
@@ -105,7 +105,7 @@ def test_tile_sizes_that_make_no_sense_are_refused(tiled, size):
         DeepReader(path)
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(seeded, max_examples=150)
 @given(st.data())
 def test_any_changed_bytes_are_refused_or_read_within_bounds(tiled, good_bytes, data):
     path, _ = tiled
