@@ -138,6 +138,7 @@ ALIASES: tuple[Alias, ...] = (
 NOT_A_ROLE: tuple[tuple[str, str, str], ...] = (
     ("vector", "", "Blender's Vector is per frame, not per shutter, and all zero under motion blur"),
     ("denoising depth", "", "Blender's Denoising Depth is not the depth of the hit"),
+    ("coverage", "vray", "V-Ray's coverage is the part of one object in the pixel, not alpha"),
     ("specular", "arnold", "Arnold's specular is lighting; specular_albedo is the colour"),
     ("n", "pbrt", "pbrt's N is the geometric normal; Ns is the shading normal"),
     ("motionvector", "", "unit and shutter of motion vectors differ between set-ups; convert to motion.X, motion.Y"),

@@ -175,7 +175,8 @@ def map_roles(channel_names: Iterable[str], overrides: Mapping[str, str] | None 
         if layer.lower() not in ("", "none"):
             found[role] = _by_option(role, layer, layers, renderer, source)
     claims: dict[str, list[RoleSource]] = {}
-    chosen = {claim.layer for claim in found.values()}
+    # One channel picked out of a wider layer, such as the A of RGBA, leaves the layer to its own role.
+    chosen = {claim.layer for claim in found.values() if len(claim.channels) > 1 or len(layers[claim.layer]) == 1}
     for layer, components in layers.items():
         if layer in chosen:
             continue  # named by an option: not up for matching, nothing to remark
@@ -198,8 +199,11 @@ def map_roles(channel_names: Iterable[str], overrides: Mapping[str, str] | None 
     if "radiance" not in found:
         raise InputError(f"{source}: no R, G, B channels; name the layer with the beauty by --map radiance=LAYER "
                          f"(layers: {', '.join(layer or 'RGB' for layer in layers)})")
-    if "coverage" not in found and "coverage" not in wanted:
+    if "coverage" not in wanted:
         alpha = layers.get(found["radiance"].layer, {}).get(3)
+        if alpha is not None and "coverage" in found:
+            raise InputError(f"{source}: {alpha!r} and {found['coverage'].layer!r} both match the role 'coverage'; "
+                             f"choose one with --map coverage=CHANNEL")
         if alpha is not None:
             found["coverage"] = RoleSource("coverage", found["radiance"].layer, (alpha,))
     _refuse_uint(found["radiance"], dtypes or {}, source)

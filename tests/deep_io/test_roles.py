@@ -103,6 +103,15 @@ def test_two_view_layers_with_a_beauty_are_an_error():
     assert mapping["coverage"].channels == ("Back.Combined.A",)
 
 
+def test_alpha_and_a_coverage_layer_are_an_error_naming_both():
+    names = ["R", "G", "B", "A", "coverage.R"]
+    with pytest.raises(InputError, match="'A' and 'coverage' both match the role 'coverage'"):
+        map_roles(names)
+    assert map_roles(names, {"coverage": "coverage"})["coverage"].channels == ("coverage.R",)
+    assert map_roles(names, {"coverage": "A"})["coverage"].channels == ("A",)
+    assert map_roles(names, attributes=["vrayInfo/version"])["coverage"].channels == ("A",)
+
+
 def test_an_option_takes_any_layer_and_any_single_channel():
     names = ["R", "G", "B", "mine.R", "mine.G", "mine.B", "extra.Q", "extra.x"]
     mapping = map_roles(names, {"albedo": "mine", "roughness": "extra.Q", "time": "extra.x"})

@@ -195,7 +195,7 @@ def test_frames_of_mitsuba_pack_with_the_field_of_view(tmp_path):
         paths.append(tmp_path / f"m{seed}.exr")
         scene.sensors()[0].film().write(str(paths[-1]))
     out = tmp_path / "deep.exr"
-    overrides = {"radiance": "RGB", "normal": "none"}
+    overrides = {"normal": "none"}
     report = pack(paths, out, PackOptions(overrides=overrides, camera="60"))
     assert report is not None
     assert report.mapping.renderer == "mitsuba"
