@@ -111,8 +111,9 @@ def _types(path: Path, part: int) -> dict[str, Any]:
     return {name: NUMPY_TYPES[spec.channelformat(index).basetype] for index, name in enumerate(spec.channelnames)}
 
 
-def write_oiio(path: Path, parts: Sequence[DeepSamples], compression: str = "zips") -> None:
-    """A deep scanline file, one subimage per part, through OpenImageIO."""
+def write_oiio(path: Path, parts: Sequence[DeepSamples], compression: str = "zips",
+               tile: tuple[int, int] | None = None) -> None:
+    """A deep file, one subimage per part, through OpenImageIO; `tile` makes it tiled."""
     specs, datas = [], []
     for index, samples in enumerate(parts):
         window = samples.window
@@ -125,6 +126,8 @@ def write_oiio(path: Path, parts: Sequence[DeepSamples], compression: str = "zip
         spec.channelnames = tuple(samples.channels)
         spec.channelformats = tuple(oiio.TypeDesc(kind) for kind in kinds)
         spec.deep = True
+        if tile:
+            spec.tile_width, spec.tile_height = tile
         spec.attribute("compression", compression)
         spec.attribute("oiio:subimagename", f"part{index}")
         specs.append(spec)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deep_io import DeepSamples, Header, MemoryCostWarning, Window, read_deep, write_deep
+from deep_io import DeepSamples, Header, MemoryCostWarning, Window, read_deep, read_headers, write_deep
 from tests.deep_io.deep_files import (
     assert_same,
     openexr_part,
@@ -78,10 +78,13 @@ def test_what_openexr_writes_we_read_bit_exact(tmp_path, samples, compression, t
 
 
 @QUICK
-@given(st.lists(deep_samples(), min_size=1, max_size=3), st.sampled_from(["none", "zips"]))
-def test_what_openimageio_writes_we_read_bit_exact(tmp_path, parts, compression):
+@given(st.lists(deep_samples(), min_size=1, max_size=3), st.sampled_from(["none", "zips"]),
+       st.sampled_from([None, (16, 16), (8, 4)]))
+def test_what_openimageio_writes_we_read_bit_exact(tmp_path, parts, compression, tile):
     parts = [finite(samples) for samples in parts]
-    write_oiio(tmp_path / "a.exr", parts, compression)
+    write_oiio(tmp_path / "a.exr", parts, compression, tile)
+    kinds = {header.type for header in read_headers(tmp_path / "a.exr")}
+    assert kinds == {"deeptile" if tile else "deepscanline"}
     for index, samples in enumerate(parts):
         assert_same(read_deep(tmp_path / "a.exr", index, threads=1)[0], samples)
 

@@ -120,3 +120,14 @@ def test_any_changed_bytes_are_refused_or_read_within_bounds(tiled, good_bytes, 
         message = str(error)
     assert "tiled.exr: " in message
     assert "\n" not in message
+
+
+@pytest.mark.parametrize(("window", "chunks"), [
+    (Window(0, 0, 2**30, 2**30), 1), (Window(0, 0, 99999, 99999), 12), (Window(0, 0, 9, 9), 2**31 - 1)])
+def test_a_tiled_header_that_promises_more_than_the_file_holds_is_refused(tiled, window, chunks):
+    path, _ = tiled
+    header = parsed(path)[0]
+    promised = replace(header, data_window=window, structure={**header.structure, "chunkCount": attribute(chunks)})
+    path.write_bytes(path.read_bytes()[:8] + encode_header(promised) + bytes(3000))
+    with pytest.raises(InputError, match=r"tiled\.exr: the header promises"):
+        DeepReader(path)
