@@ -14,7 +14,7 @@ import torch
 from deep_io import DeepSamples, Header, Window, write_deep
 from deep_io.attributes import attribute
 from model import zoo
-from model.config import FAST
+from model.config import FAST, UNetConfig
 from model.denoiser import Denoiser
 
 WINDOW = Window(-5, 3, 58, 42)
@@ -67,7 +67,8 @@ def changed(samples: DeepSamples, **channels: np.ndarray) -> DeepSamples:
 def random_weights(path: Path, seed: int = 0) -> Path:
     """Weights of a small untrained network: what it must get right, it must get right without training."""
     torch.manual_seed(seed)
-    config = dataclasses.replace(FAST, name="random")
+    unet = UNetConfig(encoder=((16,), (16,)), bottleneck=(16,), decoder=((16,), (16,)), scale=2)
+    config = dataclasses.replace(FAST, name="random", unet=unet, kernel_sizes=(3, 3, 3))
     zoo.save(Denoiser(config), path, {"description": "random"})
     return path
 

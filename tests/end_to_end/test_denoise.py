@@ -1,0 +1,197 @@
+"""`lbmc denoise` as a user runs it: what is written, what is kept, what is refused, what is said."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from deep_io import Window
+from pipelines import __version__
+from tests.end_to_end.scenes import (
+    WINDOW,
+    changed,
+    noisy_scene,
+    random_weights,
+    read_flat,
+    rgb,
+    write_scene,
+)
+from tests.runner import LBMC, Runner, environment, in_process, installed
+
+TINY = Window(0, 0, 23, 15)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return random_weights(tmp_path_factory.mktemp("weights") / "random.safetensors")
+
+
+@pytest.mark.parametrize("runner", [in_process, installed])
+def test_a_beauty_of_the_inputs_windows_is_written(runner: Runner, weights: Path, tmp_path: Path) -> None:
+    source = write_scene(
+        tmp_path / "in.exr", owner="somebody", lbmc__weighting="uniform", capDate="2020:01:01 00:00:00"
+    )
+    run = runner("denoise", source, tmp_path / "out.exr", "--model", weights)
+    assert run.code == 0, run.err
+    assert run.out == ""
+    assert re.search(r"^Progress: 100%$", run.err, re.MULTILINE)
+    channels, header = read_flat(tmp_path / "out.exr")
+    assert set(channels) == {"R", "G", "B", "A"}
+    for pixels in channels.values():
+        assert pixels.dtype == np.float16
+        assert pixels.shape == (WINDOW.height, WINDOW.width)
+        assert np.isfinite(pixels).all()
+    low, high = header["dataWindow"]
+    assert (*low, *high) == (WINDOW.xmin, WINDOW.ymin, WINDOW.xmax, WINDOW.ymax)
+    assert header["owner"] == "somebody"
+    assert header["lbmc:version"] == __version__
+    assert header["lbmc:model"] == "random"
+    assert "lbmc:weighting" not in header
+    assert header["type"] == OpenEXR.scanlineimage
+
+
+def test_the_same_input_gives_the_same_bytes(weights: Path, tmp_path: Path) -> None:
+    source = write_scene(tmp_path / "in.exr")
+    outputs = [tmp_path / "a.exr", tmp_path / "b.exr"]
+    for output in outputs:
+        assert in_process("denoise", source, output, "--model", weights, "--threads", "1").code == 0
+    assert outputs[0].read_bytes() == outputs[1].read_bytes()
+
+
+def test_the_pixel_type_and_compression_asked_for(weights: Path, tmp_path: Path) -> None:
+    source = write_scene(tmp_path / "in.exr", noisy_scene(2, TINY))
+    words = ("--model", weights, "--pixel-type", "float", "--compression", "piz")
+    assert in_process("denoise", source, tmp_path / "out.exr", *words).code == 0
+    channels, header = read_flat(tmp_path / "out.exr")
+    assert channels["R"].dtype == np.float32
+    assert header["compression"] == OpenEXR.PIZ_COMPRESSION
+
+
+def test_a_sequence_is_denoised_frame_by_frame(weights: Path, tmp_path: Path) -> None:
+    for number in range(1001, 1006):
+        write_scene(tmp_path / f"in.{number}.exr", noisy_scene(number, TINY))
+    words = ("--model", weights, "--frames", "1001-1005x2")
+    run = in_process("denoise", tmp_path / "in.####.exr", tmp_path / "out.%04d.exr", *words)
+    assert run.code == 0, run.err
+    assert sorted(path.name for path in tmp_path.glob("out*")) == ["out.1001.exr", "out.1003.exr", "out.1005.exr"]
+    assert "3 of 3 frames done" in run.err
+
+
+def test_a_frame_that_fails_does_not_stop_the_others_and_is_listed_at_the_end(weights: Path, tmp_path: Path) -> None:
+    for number in (1, 2, 3):
+        write_scene(tmp_path / f"in.{number:04d}.exr", noisy_scene(number, TINY))
+    broken = tmp_path / "in.0002.exr"
+    broken.write_bytes(broken.read_bytes()[:-200])
+    run = in_process("denoise", tmp_path / "in.####.exr", tmp_path / "out.####.exr", "--model", weights)
+    assert run.code == 1
+    assert sorted(path.name for path in tmp_path.glob("out*")) == ["out.0001.exr", "out.0003.exr"]
+    assert len(re.findall(r"^ERROR: .*in\.0002\.exr", run.err, re.MULTILINE)) == 1
+    assert "in.0002.exr" in run.err.split("failed frames:")[1]
+    assert "2 of 3 frames done, 1 failed" in run.err
+
+
+def test_an_existing_output_is_refused_kept_or_replaced(weights: Path, tmp_path: Path) -> None:
+    source, output = write_scene(tmp_path / "in.exr", noisy_scene(3, TINY)), tmp_path / "out.exr"
+    output.write_text("precious")
+    refused = in_process("denoise", source, output, "--model", weights)
+    assert refused.code == 2
+    assert "--overwrite" in refused.err
+    kept = in_process("denoise", source, output, "--model", weights, "--skip-existing")
+    assert kept.code == 0
+    assert "skipped" in kept.err
+    assert output.read_text() == "precious"
+    assert in_process("denoise", source, output, "--model", weights, "--overwrite").code == 0
+    assert rgb(output).shape == (TINY.height, TINY.width, 3)
+
+
+@pytest.mark.parametrize("link", [os.symlink, os.link])
+def test_an_input_is_never_written_over(link: object, weights: Path, tmp_path: Path) -> None:
+    source = write_scene(tmp_path / "in.exr", noisy_scene(3, TINY))
+    before = source.read_bytes()
+    link(source, tmp_path / "link.exr")  # type: ignore[operator]
+    for output in (source, tmp_path / "link.exr"):
+        run = in_process("denoise", source, output, "--model", weights, "--overwrite")
+        assert run.code == 2
+        assert "input" in run.err
+    assert source.read_bytes() == before
+
+
+def test_what_lbmc_wrote_is_taken_only_with_force(weights: Path, tmp_path: Path) -> None:
+    source = write_scene(tmp_path / "in.exr", noisy_scene(3, TINY), lbmc__model="fast")
+    run = in_process("denoise", source, tmp_path / "out.exr", "--model", weights)
+    assert run.code == 3
+    assert "--force" in run.err
+    assert in_process("denoise", source, tmp_path / "out.exr", "--model", weights, "--force").code == 0
+
+
+def test_broken_samples_are_left_out_and_counted(weights: Path, tmp_path: Path) -> None:
+    samples = noisy_scene(4, TINY)
+    red, roughness = samples.channels["R"].copy(), samples.channels["roughness"].copy()
+    red[[5, 50]], roughness[np.flatnonzero(samples.channels["A"])[-3:]] = np.nan, np.inf
+    source = write_scene(tmp_path / "in.exr", changed(samples, R=red, roughness=roughness))
+    run = in_process("denoise", source, tmp_path / "out.exr", "--model", weights)
+    assert run.code == 0
+    assert "2 radiance" in run.err
+    assert "3 roughness" in run.err
+    assert np.isfinite(rgb(tmp_path / "out.exr")).all()
+
+
+def test_values_beyond_half_are_clamped_counted_and_said(weights: Path, tmp_path: Path) -> None:
+    samples = noisy_scene(5, TINY, dtype=np.float32)
+    bright = {name: samples.channels[name] * np.float32(1e7) for name in "RGB"}
+    source = write_scene(tmp_path / "in.exr", changed(samples, **bright))
+    run = in_process("denoise", source, tmp_path / "out.exr", "--model", weights)
+    assert run.code == 0
+    assert re.search(r"\d+ values beyond half's range were clamped", run.err)
+    assert rgb(tmp_path / "out.exr").max() == 65504
+
+
+def test_a_dry_run_says_everything_and_writes_nothing(weights: Path, tmp_path: Path) -> None:
+    source = write_scene(tmp_path / "in.exr")
+    run = in_process("denoise", source, tmp_path / "out.exr", "--model", weights, "--dry-run")
+    assert run.code == 0
+    assert list(tmp_path.iterdir()) == [source]
+    for word in ("radiance   <- R G B", "weighting: uniform", "layers: ", "exposure: ", "MiB"):
+        assert word in run.out
+
+
+def test_a_gpu_that_is_not_there_is_a_usage_error(weights: Path, tmp_path: Path) -> None:
+    source = write_scene(tmp_path / "in.exr", noisy_scene(3, TINY))
+    run = in_process("denoise", source, tmp_path / "out.exr", "--model", weights, "--device", "cuda:63")
+    assert run.code == 2
+    assert "cuda:63" in run.err
+
+
+def test_openjd_progress_goes_to_standard_output(weights: Path, tmp_path: Path) -> None:
+    source = write_scene(tmp_path / "in.exr", noisy_scene(3, TINY))
+    run = installed("denoise", source, tmp_path / "out.exr", "--model", weights, "--progress", "openjd")
+    assert run.code == 0
+    assert "openjd_progress: 100" in run.out.splitlines()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_leaves_no_file_behind(number: signal.Signals, weights: Path, tmp_path: Path) -> None:
+    for frame in range(1, 60):
+        write_scene(tmp_path / f"in.{frame:04d}.exr", noisy_scene(frame, TINY))
+    command = [LBMC, "denoise", tmp_path / "in.####.exr", tmp_path / "out.####.exr", "--model", weights]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment()) as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if re.match(r"Progress: [1-9]", line):
+                break
+        process.send_signal(number)
+        _, rest = process.communicate(timeout=60)
+    assert process.returncode == 128 + number
+    assert rest.splitlines()[-1].startswith("ERROR: ")
+    time.sleep(0.1)
+    assert not list(tmp_path.glob(".*"))
+    for output in tmp_path.glob("out.*.exr"):
+        assert rgb(output).shape == (TINY.height, TINY.width, 3)
