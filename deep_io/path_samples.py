@@ -23,8 +23,36 @@ from deep_io.samples import DeepSamples
 __all__ = ["PathSamples", "SampleReader"]
 
 
+# A block's samples at most: decoding `over` takes about 200 bytes for each while it runs.
+MAX_BLOCK_SAMPLES = 1 << 21
+
+
 class SampleReader:
     """An open deep sample file, read as path samples.
+
+    The file: a deep EXR in which every deep sample is one path sample; a pixel may hold any number, also none. What
+    `lbmc` itself writes, and what it reads without any option:
+
+        channel            type        role and meaning
+        R G B              half/float  radiance    linear, of the path; the only one required
+        A                  half/float  coverage    1 hit, 0 miss, fractions for opacity; without A: 1 where Z < 1e10
+        Z                  float       depth       planar, camera space; a miss has 1e10 or more, also under A = 1
+        N.X N.Y N.Z        half/float  normal      shading normal, view space: x right, y up, z toward the camera
+        albedo.R .G .B     half/float  albedo      diffuse albedo
+        specular.R .G .B   half/float  specular    specular colour (F0)
+        roughness          half/float  roughness   0..1
+        motion.X motion.Y  half/float  motion      over the whole shutter, pixels, x right, y down
+        coc                half/float  coc         signed circle-of-confusion radius, pixels, + behind the focus plane
+        lens.X lens.Y      half/float  lens        on the unit disk; pixel = pinhole projection - coc * lens
+        time               half/float  time        0..1 within the shutter
+
+        attribute           value
+        lbmc:weighting      "uniform" (the default), "packed" or "over"; see weighting.py and over.py
+        lbmc:normals        "world" where N could not be turned into view space; worldToCamera or --camera is needed
+        lbmc:depth          "distance" where Z is the length of the ray; "none" where Z only orders the samples
+        lbmc:radianceLayers the layers of a packed file that are encoded as radiance is
+
+    Other channel names are understood through aliases.py. Features of a miss are never read.
 
     Parameters
         path       the file
@@ -89,7 +117,13 @@ class SampleReader:
         return self._decode(self._reader.read(y0, y1, self.mapping.channels))
 
     def blocks(self, max_bytes: int = DEFAULT_BLOCK_BYTES) -> Iterator[PathSamples]:
-        """The frame in blocks of whole rows from the top; `max_bytes` bounds a block's stored samples."""
+        """The frame in blocks of whole rows from the top.
+
+        `max_bytes` bounds the stored samples of a block, MAX_BLOCK_SAMPLES their number (a larger row stands alone).
+        """
+        types = {channel.name: channel.dtype.itemsize for channel in self.header.channels}
+        sample_bytes = sum(types[name] for name in self.mapping.channels)
+        max_bytes = min(max_bytes, MAX_BLOCK_SAMPLES * sample_bytes)
         for block in self._reader.blocks(max_bytes, self.mapping.channels):
             yield self._decode(block)
 

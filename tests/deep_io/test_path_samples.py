@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ import pytest
 
 from deep_io import DeepSamples, Header, Window, write_deep
 from deep_io.errors import InputError, UsageError
+from deep_io.flat import read_flat
 from deep_io.path_samples import PathSamples, SampleReader
 
 NAN, INF = math.nan, math.inf
@@ -175,6 +178,26 @@ def test_blocks_hold_the_same_samples_as_the_whole(file):
         np.testing.assert_array_equal(np.concatenate([block.roles[role] for block in blocks]), values)
     np.testing.assert_array_equal(np.concatenate([block.counts for block in blocks]), whole.counts)
     np.testing.assert_array_equal(np.concatenate([block.weight for block in blocks]), whole.weight)
+
+
+def test_over_means_what_openimageio_flattens(file):
+    rng = np.random.default_rng(5)
+    counts = rng.integers(0, 6, (9, 11)).astype(np.int32)
+    total = int(counts.sum())
+    alpha = rng.choice([0, 0.25, 0.5, 1], total)
+    depth = np.sort(rng.permutation(total)) + 1  # distinct and front to back: OpenImageIO does not sort
+    path = write(file, {**{name: rng.random(total) for name in "RGB"}, "A": alpha, "Z": depth}, counts,
+                 dtype=np.float32)
+    flat = file.with_name("flat.exr")
+    subprocess.run([Path(sys.executable).with_name("oiiotool"), path, "--flatten", "-o", flat], check=True)
+    expected = read_flat(flat).channels
+    samples = read(path, weighting="over")
+    pixel = np.repeat(np.arange(counts.size), samples.counts.ravel())
+    for index, name in enumerate("RGB"):
+        got = np.bincount(pixel, samples.weight * samples.roles["radiance"][:, index].astype(np.float64), counts.size)
+        np.testing.assert_allclose(got.reshape(counts.shape), expected[name], rtol=1e-5, atol=1e-6)
+    got = np.bincount(pixel, samples.weight * samples.coverage, counts.size)
+    np.testing.assert_allclose(got.reshape(counts.shape), expected["A"], atol=1e-6)
 
 
 def matrix_attribute(rotation: np.ndarray) -> list[float]:
