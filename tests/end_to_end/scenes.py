@@ -64,11 +64,11 @@ def changed(samples: DeepSamples, **channels: np.ndarray) -> DeepSamples:
     return DeepSamples(samples.counts, {**samples.channels, **replaced}, samples.window)
 
 
-def random_weights(path: Path, seed: int = 0) -> Path:
+def random_weights(path: Path, seed: int = 0, **config_changes: Any) -> Path:
     """Weights of a small untrained network: what it must get right, it must get right without training."""
     torch.manual_seed(seed)
     unet = UNetConfig(encoder=((16,), (16,)), bottleneck=(16,), decoder=((16,), (16,)), scale=2)
-    config = dataclasses.replace(FAST, name="random", unet=unet, kernel_sizes=(3, 3, 3))
+    config = dataclasses.replace(FAST, name="random", unet=unet, kernel_sizes=(3, 3, 3), **config_changes)
     zoo.save(Denoiser(config), path, {"description": "random"})
     return path
 

@@ -73,6 +73,15 @@ def test_the_order_of_the_samples_does_not_matter(weights: Path, tmp_path: Path)
     assert close(denoise(tmp_path, "other", shuffled, weights), before)
 
 
+def test_a_sample_split_into_two_of_half_weight_changes_nothing(tmp_path: Path) -> None:
+    # Without the statistics, which see the effective number of samples: twice as many mean less noise.
+    weights = random_weights(tmp_path / "random.safetensors", statistics=False)
+    samples = noisy_scene(11, SMALL)
+    split = DeepSamples(2 * samples.counts, {name: np.repeat(v, 2) for name, v in samples.channels.items()}, SMALL)
+    before = denoise(tmp_path, "one", samples, weights)
+    assert close(denoise(tmp_path, "other", split, weights), before)
+
+
 @pytest.mark.parametrize("more", [("--threads", "1"), ("--memory", "1MiB")])
 def test_threads_and_memory_budget_change_nothing(more: tuple[str, str], weights: Path, tmp_path: Path) -> None:
     samples = noisy_scene(5, Window(0, 0, 24, 119), most=2)
