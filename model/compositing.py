@@ -21,7 +21,7 @@ class Layers:
     color : (B, L, 3, H, W) C_l, radiance times visible weight
     weight : (B, L, H, W) V_l >= 0, sums to 1 over layers wherever any sample reaches
     coverage : (B, L, H, W) A_l, 0 <= A_l <= V_l
-    depth : (B, L, H, W) Z_l, mean depth of the layer's hits in scene units, inf where it has none
+    depth : (B, L, H, W) Z_l, mean depth of the layer's hits in scene units, inf where it has none; 1 without that role
     """
 
     color: Tensor

@@ -113,7 +113,7 @@ class Denoiser(nn.Module):
         contexts, embedding = self._context(samples, relative, scale)
         context = _rows(contexts[0], samples.shape)  # (P, C)
         if config.variant == "sample_splat":
-            visible = self._splat_samples(samples, context, scale)
+            visible = self._splat_samples(samples, embedding, context, scale)
         elif config.kernel == "direct":
             visible = self._filter_direct(samples, embedding, relative, contexts, context, scale, keep)
         else:
@@ -198,9 +198,10 @@ class Denoiser(nn.Module):
             planes.append(self._splat(part, embedding, part_relative, context[rows], scale, keep))
         return filter_direct(_picture(planes, samples.shape), contexts, self.generators, self.config)
 
-    def _splat_samples(self, samples: Samples, context: Tensor, scale: FrameScale) -> Tensor:
+    def _splat_samples(self, samples: Samples, embedding: Tensor, context: Tensor, scale: FrameScale) -> Tensor:
         """(B, 1, 6, H, W) visible planes."""
-        embedding = torch.cat([self.reducer(part, scale) for part, _, _ in _chunks(samples, None)], 0)
+        if len(embedding) < len(samples.weight):
+            embedding = torch.cat([self.reducer(part, scale) for part, _, _ in _chunks(samples, None)], 0)
         generator = self.generators[0]
         assert isinstance(generator, Mlp)
         return splat_samples(samples, basic_values(samples, scale), embedding, context, generator)
