@@ -21,6 +21,7 @@ from deep_io import sequences
 from deep_io.atomic import atomic_output, output_action
 from deep_io.errors import InputError, UsageError
 from deep_io.flat import to_half, write_flat
+from deep_io.header import Header
 from deep_io.path_samples import SampleReader
 from model import zoo
 from model.denoiser import Denoiser
@@ -160,9 +161,11 @@ class Job:
 
     def frame(self, frame: sequences.Frame, progress: Progress) -> DenoisedFrame:
         """Denoises one frame. Raises FrameSkippedError, LbmcError."""
-        assert frame.target is not None
-        if not self.options.dry_run and not output_action(frame.target, [frame.source], self.options.existing):
-            raise FrameSkippedError(f"{frame.target} exists")
+        targets = self.targets(frame)
+        if not self.options.dry_run:
+            targets = [path for path in targets if output_action(path, [frame.source], self.options.existing)]
+            if not targets:
+                raise FrameSkippedError(f"{frame.target} exists")
         begun = time.perf_counter()
         with self.open(frame.source) as reader:
             plan = self.plan(frame.source, reader, progress.update)
@@ -178,18 +181,32 @@ class Job:
             )
             header = reader.header
         network = time.perf_counter()
-        color, clamped = to_pixel_type(layers.beauty(), self.options.pixel_type)
+        clamped = self.write(targets, layers, header)
         if clamped:
             progress.note(f"{frame.target}: {clamped} values beyond half's range were clamped; "
                           f"--pixel-type float keeps them")
-        alpha, _ = to_pixel_type(layers.alpha(), self.options.pixel_type)
-        channels = {name: np.ascontiguousarray(color[..., k]) for k, name in enumerate("RGB")}
-        channels["A"] = alpha
-        with atomic_output(frame.target) as temporary:
-            write_flat(temporary, channels, header, self.options.compression, self.provenance())
         seconds = {"survey": surveyed - begun, "network": network - surveyed,
                    "write": time.perf_counter() - network}
         return DenoisedFrame(frame.target, plan, clamped, seconds)
+
+    def targets(self, frame: sequences.Frame) -> list[Path]:
+        """The files that a frame becomes."""
+        assert frame.target is not None
+        return [frame.target]
+
+    def write(self, targets: list[Path], layers: FrameLayers, header: Header) -> int:
+        """Writes those of a frame's files that are wanted; returns how many values were clamped to half's range."""
+        channels, clamped = self.beauty(layers)
+        for target in targets:
+            with atomic_output(target) as temporary:
+                write_flat(temporary, channels, header, self.options.compression, self.provenance())
+        return clamped
+
+    def beauty(self, layers: FrameLayers) -> tuple[dict[str, npt.NDArray[Any]], int]:
+        """R, G, B and A in the type to be written, and how many values were clamped to it."""
+        color, clamped = to_pixel_type(layers.beauty(), self.options.pixel_type)
+        alpha, _ = to_pixel_type(layers.alpha(), self.options.pixel_type)
+        return {**{name: np.ascontiguousarray(color[..., k]) for k, name in enumerate("RGB")}, "A": alpha}, clamped
 
     def provenance(self) -> dict[str, str]:
         """Header attributes that say what made a file; no times, so that the same input gives the same bytes."""
@@ -205,12 +222,17 @@ def denoise_frames(options: DenoiseOptions) -> JobReport[DenoisedFrame]:
 
     Raises InputError or UsageError for what concerns the whole job, before any frame is touched.
     """
+    return run_job(Job, options)
+
+
+def run_job(kind: type[Job], options: DenoiseOptions) -> JobReport[DenoisedFrame]:
+    """Runs a job of some kind on the frames that its options name; raises what `denoise_frames` does."""
     frames = sequences.pair(options.source, options.target, options.frames)
+    job = kind(options)
     if not options.dry_run:
         for frame in frames:  # a refused output is found before hours of work, not after
-            assert frame.target is not None
-            output_action(frame.target, [other.source for other in frames], options.existing)
-    job = Job(options)
+            for target in job.targets(frame):
+                output_action(target, [other.source for other in frames], options.existing)
     progress = make_progress(options.progress, len(frames))
     with progress:
         return run_frames(frames, job.frame, progress, str)
