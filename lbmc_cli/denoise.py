@@ -8,6 +8,7 @@ import click
 
 from lbmc_cli.options import (
     PROGRESS,
+    THREADS,
     ByteSize,
     Device,
     LbmcCommand,
@@ -80,7 +81,7 @@ def _layers(ctx: click.Context, parameter: click.Parameter, value: str) -> int |
     metavar="auto|cpu|cuda:N",
     help="Where the network runs.",
 )
-@option("--threads", type=click.IntRange(1), metavar="N", help="CPU threads.  [default: all that the process may use]")
+@THREADS
 @option("--memory", type=ByteSize(), metavar="SIZE", help="Memory budget, e.g. 2GiB.")
 @option(
     "--precision",

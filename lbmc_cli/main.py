@@ -24,7 +24,9 @@ import click
 COMMANDS = {
     "denoise": "Denoise a deep sample file, or a sequence of them, to a flat beauty.",
     "info": "Show what a deep sample file holds and how it would be read.",
+    "pack": "Pack one-sample flat renders into one deep sample file.",
     "compare": "Measure an image against its reference.",
+    "train": "Train a network on deep sample files with references.",
     "models": "List the weights that are here.",
 }
 """Subcommands in the order of `--help`; each lives in lbmc_cli/NAME.py as a click command of that name."""

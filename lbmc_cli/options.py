@@ -108,47 +108,65 @@ def part_choice(part: str | None) -> str | int | None:
     return int(part) if part is not None and part.isdigit() else part
 
 
-def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The options that say how a deep sample file is read; the same for every command that reads one."""
-    for decorate in reversed(
-        (
-            option(
-                "--part", help="Part of a multi-part file, by name or number from 0.  [default: the only deep part]"
-            ),
-            option(
-                "--map",
-                "overrides",
-                multiple=True,
-                metavar="ROLE=LAYER",
-                callback=role_overrides,
-                help="Layer or channel that plays a role, e.g. normal=N_world; empty drops the role. Repeatable.",
-            ),
-            option(
-                "--weighting",
-                type=click.Choice(["uniform", "packed", "over"]),
-                help="How samples are weighted.  [default: by the header; uniform where every alpha is 0 or 1]",
-            ),
-            option(
-                "--normals",
-                type=click.Choice(["auto", "world", "view"]),
-                default="auto",
-                show_default=True,
-                help="Space of the normals.",
-            ),
-            option(
-                "--depth",
-                type=click.Choice(["z", "distance"]),
-                default="z",
-                show_default=True,
-                help="Planar depth, or distance along the ray.",
-            ),
-            option("--camera", metavar="FILE", help="File that carries the camera (worldToCamera) when IN does not."),
-        )
-    ):
-        command = decorate(command)
-    return command
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
+def _together(*decorators: Decorator) -> Decorator:
+    """Several options as one decorator; `--help` shows them in this order."""
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        for decorator in reversed(decorators):
+            command = decorator(command)
+        return command
+
+    return decorate
+
+
+mapping_options = _together(
+    option(
+        "--map",
+        "overrides",
+        multiple=True,
+        metavar="ROLE=LAYER",
+        callback=role_overrides,
+        help="Layer or channel that plays a role, e.g. normal=N_world; empty drops the role. Repeatable.",
+    ),
+    option(
+        "--normals",
+        type=click.Choice(["auto", "world", "view"]),
+        default="auto",
+        show_default=True,
+        help="Space of the normals.",
+    ),
+    option(
+        "--depth",
+        type=click.Choice(["z", "distance"]),
+        default="z",
+        show_default=True,
+        help="Planar depth, or distance along the ray.",
+    ),
+    option(
+        "--camera",
+        metavar="FILE|DEGREES",
+        help="Camera that the input's header lacks: an EXR or JSON file, or the horizontal field of view.",
+    ),
+)
+"""Which channels play which role, and in which convention."""
+
+reading_options = _together(
+    option("--part", help="Part of a multi-part file, by name or number from 0.  [default: the only deep part]"),
+    option(
+        "--weighting",
+        type=click.Choice(["uniform", "packed", "over"]),
+        help="How samples are weighted.  [default: by the header; uniform where every alpha is 0 or 1]",
+    ),
+    mapping_options,
+)
+"""How a deep sample file is read; the same for every command that reads one."""
+
+THREADS = option(
+    "--threads", type=click.IntRange(1), metavar="N", help="CPU threads.  [default: all that the process may use]"
+)
 PROGRESS = option(
     "--progress",
     type=click.Choice(["auto", "bar", "plain", "openjd", "none"]),
