@@ -30,8 +30,9 @@ build/wheel: $(VENV)/made setup.cfg pyproject.toml README.md $(SOURCES)
 
 # The wheel itself is put in anew each time (same version, new contents); what it depends on stays.
 $(VENV)/runtime: build/wheel constraints.txt
-	$(PIP) install -c constraints.txt build/wheel/*.whl
-	$(PIP) install --no-deps --force-reinstall build/wheel/*.whl
+	wheel=$$(echo build/wheel/*.whl)
+	$(PIP) install -c constraints.txt "$$wheel[train]"
+	$(PIP) install --no-deps --force-reinstall "$$wheel"
 	touch $@
 
 $(VENV)/tested: build/wheel constraints.txt
@@ -41,7 +42,7 @@ $(VENV)/tested: build/wheel constraints.txt
 	touch $@
 
 demo: $(VENV)/runtime
-	@PATH=$(BIN):$$PATH bash examples/demo.sh
+	@PATH=$(BIN):$$PATH examples/demo.sh build/demo
 
 lint: $(VENV)/tested
 	$(BIN)/ruff check .
