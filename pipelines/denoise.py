@@ -29,11 +29,13 @@ from model.features import FrameScale
 from pipelines import __version__
 from pipelines.inference import FrameLayers, denoise_bands
 from pipelines.jobs import FrameSkippedError, JobReport, run_frames
+from pipelines.keep import kept_channels
 from pipelines.options import DenoiseOptions
 from pipelines.progress import Progress, make_progress
 from pipelines.survey import Survey, survey
 from pipelines.tiles import DEFAULT_MEMORY, Band, memory_needed, plan_bands
 
+KEEP_BLOCK_BYTES = 64 << 20
 SURVEY_SHARE = 0.15  # of a frame's progress
 MODEL_ATTRIBUTE, WEIGHTS_ATTRIBUTE, VERSION_ATTRIBUTE = "lbmc:model", "lbmc:weights", "lbmc:version"
 
@@ -180,8 +182,10 @@ class Job:
                 lambda done: progress.update(SURVEY_SHARE + (1 - SURVEY_SHARE) * done),
             )
             header = reader.header
+            wanted = self.options.keep
+            kept = kept_channels(reader.path, self.options.part, reader.weighting, wanted, KEEP_BLOCK_BYTES) if wanted else {}
         network = time.perf_counter()
-        clamped = self.write(targets, layers, header)
+        clamped = self.write(frame, targets, plan, layers, header)
         if clamped:
             progress.note(f"{frame.target}: {clamped} values beyond half's range were clamped; "
                           f"--pixel-type float keeps them")
@@ -194,10 +198,11 @@ class Job:
         assert frame.target is not None
         return [frame.target]
 
-    def write(self, targets: list[Path], layers: FrameLayers, header: Header) -> int:
+    def write(self, frame: sequences.Frame, wanted: list[Path], plan: FramePlan, layers: FrameLayers, header: Header
+              ) -> int:
         """Writes those of a frame's files that are wanted; returns how many values were clamped to half's range."""
         channels, clamped = self.beauty(layers)
-        for target in targets:
+        for target in wanted:
             with atomic_output(target) as temporary:
                 write_flat(temporary, channels, header, self.options.compression, self.provenance())
         return clamped
