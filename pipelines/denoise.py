@@ -182,8 +182,6 @@ class Job:
                 lambda done: progress.update(SURVEY_SHARE + (1 - SURVEY_SHARE) * done),
             )
             header = reader.header
-            wanted = self.options.keep
-            kept = kept_channels(reader.path, self.options.part, reader.weighting, wanted, KEEP_BLOCK_BYTES) if wanted else {}
         network = time.perf_counter()
         clamped = self.write(frame, targets, plan, layers, header)
         if clamped:
@@ -202,6 +200,10 @@ class Job:
               ) -> int:
         """Writes those of a frame's files that are wanted; returns how many values were clamped to half's range."""
         channels, clamped = self.beauty(layers)
+        if self.options.keep:
+            source, part = os.fspath(frame.source), self.options.part
+            kept = kept_channels(source, part, plan.shot.weighting, self.options.keep, KEEP_BLOCK_BYTES)
+            channels = {**kept, **channels}
         for target in wanted:
             with atomic_output(target) as temporary:
                 write_flat(temporary, channels, header, self.options.compression, self.provenance())

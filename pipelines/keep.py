@@ -1,0 +1,69 @@
+"""Channels of the input that travel to the output as they are: unfiltered pixel means, for `--keep`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from deep_io.deep_reader import DeepReader
+from deep_io.errors import InputError, UsageError
+from deep_io.samples import DeepSamples
+
+WRITTEN = ("R", "G", "B", "A")  # the beauty's own channels
+
+
+def matching_channels(names: Sequence[str], wanted: Sequence[str], source: str) -> list[str]:
+    """Channels that a request names: a channel, a layer (all its channels) or a glob.
+
+    Raises InputError for a request that matches nothing; the message lists what there is.
+    """
+    found: list[str] = []
+    for request in wanted:
+        matches = [name for name in names
+                   if name == request or name.startswith(f"{request}.") or fnmatchcase(name, request)]
+        if not matches:
+            raise InputError(f"{source}: no channel or layer {request!r} to keep; there are {', '.join(names)}")
+        found += [name for name in matches if name not in found and name not in WRITTEN]
+    return found
+
+
+def kept_channels(
+    path: str, part: int | str | None, weighting: str, wanted: Sequence[str], max_bytes: int
+) -> dict[str, npt.NDArray[Any]]:
+    """Pixel means (H, W), in the file's type, of the channels asked for; 0 where a pixel has no finite value.
+
+    Raises InputError for ids (an average of ids is no id), UsageError unless every sample weighs the same.
+    """
+    if weighting != "uniform":
+        raise UsageError(f"{path}: --keep averages samples of equal weight, these are weighted {weighting}")
+    with DeepReader(path, part) as reader:
+        channels = {channel.name: channel.dtype for channel in reader.header.channels}
+        names = matching_channels(list(channels), wanted, path)
+        ids = [name for name in names if channels[name].kind == "u"]
+        if ids:
+            raise InputError(f"{path}: channel {ids[0]} holds ids, which cannot be averaged; leave it out of --keep")
+        window = reader.header.data_window
+        out = {name: np.zeros((window.height, window.width), channels[name]) for name in names}
+        for block in reader.blocks(max_bytes, names):
+            first = block.window.ymin - window.ymin
+            for name in names:
+                out[name][first : first + block.window.height] = _pixel_means(block, name)
+    return out
+
+
+def _pixel_means(block: DeepSamples, name: str) -> npt.NDArray[np.float64]:
+    """(H, W) means of the finite values of each pixel."""
+    values = block.channels[name].astype(np.float64)
+    finite = np.isfinite(values)
+    some = block.counts.reshape(-1) > 0
+    starts = block.offsets[:-1][some]
+    means = np.zeros(block.counts.size)
+    if starts.size:
+        sums = np.add.reduceat(np.where(finite, values, 0), starts)
+        counts = np.add.reduceat(finite.astype(np.float64), starts)
+        means[some] = sums / np.maximum(counts, 1)
+    return means.reshape(block.counts.shape)
