@@ -45,9 +45,15 @@ class FrameLayers:
         return alpha
 
 
-def to_model(block: PathSamples, roles: tuple[str, ...], device: torch.device) -> Samples:
-    """A block of decoded samples as the model's input, with those of the roles that the block has."""
+def to_model(block: PathSamples, roles: tuple[str, ...], depth: float, device: torch.device) -> Samples:
+    """A block of decoded samples as the model's input, with those of the roles that the block has.
+
+    A depth of 0 is an unknown one and becomes `depth`, the frame's scale, which tells the network nothing.
+    """
     height, width = block.counts.shape
+    if "depth" in block.roles:
+        unknown = block.roles["depth"] <= 0
+        block.roles["depth"] = np.where(unknown, np.float32(depth), block.roles["depth"])
 
     def tensor(array: npt.NDArray[np.generic]) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(device)
@@ -82,7 +88,7 @@ def denoise_bands(
         depth=torch.empty(1, layers, *size),
     )
     for number, band in enumerate(bands):
-        samples = to_model(reader.read(window.ymin + band.read0, window.ymin + band.read1), roles, device)
+        samples = to_model(reader.read(window.ymin + band.read0, window.ymin + band.read1), roles, scale.depth, device)
         result = net(samples, scale, layers, fill=False)
         rows = slice(band.y0 - band.read0, band.y1 - band.read0)
         for whole, part in zip(_planes(frame), _planes(result), strict=True):
