@@ -6,57 +6,16 @@ from typing import Any
 
 import click
 
-from lbmc_cli.options import (
-    PROGRESS,
-    THREADS,
-    ByteSize,
-    Device,
-    LbmcCommand,
-    build_options,
-    option,
-    part_choice,
-    reading_options,
-)
-from lbmc_cli.report import end_job, existing_choice
-from pipelines.options import ALL_LAYERS, COMPRESSIONS, DenoiseOptions
-
-
-def _layers(ctx: click.Context, parameter: click.Parameter, value: str) -> int | None:
-    if value == "auto":
-        return None
-    if value.isdigit() and 1 <= int(value) <= ALL_LAYERS:
-        return int(value)
-    raise click.BadParameter(f"{value!r} is not auto or a number from 1 to {ALL_LAYERS}", ctx, parameter)
+from lbmc_cli.job_options import job_choices, job_options, machine_options
+from lbmc_cli.options import LbmcCommand, build_options, option
+from lbmc_cli.report import end_job
+from pipelines.options import COMPRESSIONS, DenoiseOptions
 
 
 @click.command(cls=LbmcCommand)
 @click.argument("source", metavar="IN")
 @click.argument("target", metavar="OUT")
-@option("--frames", metavar="RANGE", help="Frames of a sequence, e.g. 1001-1100x2.  [default: those on disk]")
-@option("--overwrite", is_flag=True, help="Replace outputs that exist.")
-@option("--skip-existing", is_flag=True, help="Leave outputs that exist and count them as done.")
-@option("--force", is_flag=True, help="Take an input that lbmc itself wrote.")
-@option("--model", metavar="PRESET|FILE", help="Preset (see: lbmc models) or a .safetensors file.")
-@option(
-    "--layers",
-    metavar=f"auto|1..{ALL_LAYERS}",
-    default="auto",
-    show_default=True,
-    callback=_layers,
-    help="Number of layers.",
-)
-@option(
-    "--no-adapt",
-    is_flag=True,
-    help="Model everything, also what the survey finds the scene does not need.",
-)
-@option(
-    "--exposure",
-    type=click.FloatRange(0.0, min_open=True),
-    help="Scale of the radiance before the network.  [default: measured]",
-)
-@option("--exposure-from", metavar="FRAME|FILE", help="Frame whose measured exposure serves all frames.")
-@reading_options
+@job_options
 @option(
     "--keep",
     "--channels",
@@ -65,46 +24,15 @@ def _layers(ctx: click.Context, parameter: click.Parameter, value: str) -> int |
     metavar="NAME",
     help="Also write this channel or layer of IN, averaged per pixel; globs work. Repeatable.",
 )
-@option(
-    "--pixel-type",
-    type=click.Choice(["half", "float"]),
-    default="half",
-    show_default=True,
-    help="Type of the colour channels.",
-)
 @option("--compression", type=click.Choice(COMPRESSIONS), default="zip", show_default=True, help="Compression of OUT.")
-@option(
-    "--device",
-    type=Device(),
-    default="auto",
-    show_default=True,
-    metavar="auto|cpu|cuda:N",
-    help="Where the network runs.",
-)
-@THREADS
-@option("--memory", type=ByteSize(), metavar="SIZE", help="Memory budget, e.g. 2GiB.")
-@option(
-    "--precision",
-    type=click.Choice(["auto", "fp32", "bf16", "fp16"]),
-    default="auto",
-    show_default=True,
-    help="Of the matrix products; kernels are always fp32.",
-)
-@option("--dry-run", is_flag=True, help="Show frames, mapping, decisions, tile plan and memory; write nothing.")
-@PROGRESS
-def denoise(overwrite: bool, skip_existing: bool, part: str | None, no_adapt: bool, **choices: Any) -> int:
+@machine_options
+def denoise(**choices: Any) -> int:
     """Denoise IN, a deep EXR whose samples are path samples, to the flat EXR OUT.
 
     IN and OUT may be sequences: shot.####.exr, shot.%04d.exr, shot.$F4.exr. Exit codes: 0 done, 1 some frames failed,
     2 usage or refused output, 3 IN unreadable or unsuitable.
     """
-    options = build_options(
-        DenoiseOptions,
-        existing=existing_choice(overwrite, skip_existing),
-        part=part_choice(part),
-        adapt=not no_adapt,
-        **choices,
-    )
+    options = build_options(DenoiseOptions, **job_choices(**choices))
     from pipelines.denoise import denoise_frames
 
     return end_job(denoise_frames(options))

@@ -23,6 +23,7 @@ import click
 
 COMMANDS = {
     "denoise": "Denoise a deep sample file, or a sequence of them, to a flat beauty.",
+    "export-layers": "Write the denoised layers as deep samples, parts, channels or files.",
     "info": "Show what a deep sample file holds and how it would be read.",
     "pack": "Pack one-sample flat renders into one deep sample file.",
     "compare": "Measure an image against its reference.",

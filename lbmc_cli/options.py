@@ -111,7 +111,7 @@ def part_choice(part: str | None) -> str | int | None:
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
-def _together(*decorators: Decorator) -> Decorator:
+def together(*decorators: Decorator) -> Decorator:
     """Several options as one decorator; `--help` shows them in this order."""
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -122,7 +122,7 @@ def _together(*decorators: Decorator) -> Decorator:
     return decorate
 
 
-mapping_options = _together(
+mapping_options = together(
     option(
         "--map",
         "overrides",
@@ -153,7 +153,7 @@ mapping_options = _together(
 )
 """Which channels play which role, and in which convention."""
 
-reading_options = _together(
+reading_options = together(
     option("--part", help="Part of a multi-part file, by name or number from 0.  [default: the only deep part]"),
     option(
         "--weighting",
