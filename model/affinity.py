@@ -14,11 +14,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+BAND_ROWS = 64  # target rows filtered at a time at inference: the weights of all their taps stay near the caches
 
 
 def pool_cells(log_n: Tensor, planes: Tensor, size: int) -> tuple[Tensor, Tensor]:
@@ -68,6 +71,14 @@ class _Level:
         self.log_spline = spline_logs(size, window, bias)
         self.wide = [self._widen(plane) for plane in (self.bias, self.features, self.values)]
 
+    def band(self, first: int, last: int) -> _Level:
+        """The same level with only the target rows first..last (exclusive), multiples of the level's size."""
+        part = copy(self)
+        part.rows = (last - first) // self.size
+        start = first // self.size
+        part.wide = [plane[..., start : start + part.rows + self.window - 1, :] for plane in self.wide]
+        return part
+
     def _widen(self, plane: Tensor) -> Tensor:
         return plane if self.size == 1 else plane.repeat_interleave(self.size, -1)
 
@@ -91,6 +102,41 @@ class _Level:
         return self.log_spline[dy][:, None] + along_x[None, :]
 
 
+def _filter(levels: Sequence[_Level], target: Tensor, preference: Tensor) -> tuple[Tensor, Tensor]:
+    """Means (B, C, H, W) over all taps of all levels, and the taps' weights (taps, B, H, W), which sum to 1."""
+    batch, _, height, width = target.shape
+    logits = target.new_empty(sum(level.window**2 for level in levels), batch, height, width)
+    tap = 0
+    for number, level in enumerate(levels):
+        aim = torch.unflatten(target, 2, (level.rows, level.size))
+        wish = torch.unflatten(preference[:, number], 1, (level.rows, level.size))
+        bias, features, _ = level.wide
+        for dy, dx, rows, cols in level.taps():
+            logit = logits[tap].view(batch, level.rows, level.size, width)
+            torch.add(wish, level.spline(dy, dx), out=logit)
+            logit += bias[:, rows, None, cols]
+            source = features[:, :, rows, None, cols]
+            for k in range(source.shape[1]):
+                logit.addcmul_(aim[:, k], source[:, k], value=2.0)
+            tap += 1
+    peak = logits.amax(0)
+    peak = torch.where(peak == -torch.inf, 0, peak)
+    logits.sub_(peak).exp_()
+    total = logits.sum(0)
+    logits.div_(torch.where(total > 0, total, 1))
+    out = target.new_zeros(batch, levels[0].values.shape[1], height, width)
+    tap = 0
+    for level in levels:
+        result = out.view(batch, -1, level.rows, level.size, width)
+        values = level.wide[2]
+        for _, _, rows, cols in level.taps():
+            weight = logits[tap].view(batch, level.rows, level.size, width)
+            for k in range(result.shape[1]):
+                result[:, k].addcmul_(weight, values[:, k, rows, None, cols])
+            tap += 1
+    return out, logits
+
+
 class _AffinityFilter(torch.autograd.Function):
     """The tap loop with a hand-written derivative: intermediate products of 50 taps would not fit the caches."""
 
@@ -98,37 +144,7 @@ class _AffinityFilter(torch.autograd.Function):
     def forward(ctx: Any, target: Tensor, preference: Tensor, sizes: Sequence[int], windows: Sequence[int],
                 *cells: Tensor) -> Tensor:
         levels = _levels(sizes, windows, cells)
-        batch, _, height, width = target.shape
-        logits = target.new_empty(sum(w * w for w in windows), batch, height, width)
-        tap = 0
-        for number, level in enumerate(levels):
-            aim = target.view(batch, -1, level.rows, level.size, width)
-            wish = preference[:, number].view(batch, level.rows, level.size, width)
-            bias, features, _ = level.wide
-            for dy, dx, rows, cols in level.taps():
-                logit = logits[tap].view(batch, level.rows, level.size, width)
-                torch.add(wish, level.spline(dy, dx), out=logit)
-                logit += bias[:, rows, None, cols]
-                source = features[:, :, rows, None, cols]
-                for k in range(source.shape[1]):
-                    logit.addcmul_(aim[:, k], source[:, k], value=2.0)
-                tap += 1
-        peak = logits.amax(0)
-        peak = torch.where(peak == -torch.inf, 0, peak)
-        logits.sub_(peak).exp_()
-        total = logits.sum(0)
-        reached = total > 0
-        logits.div_(torch.where(reached, total, 1))
-        out = target.new_zeros(batch, levels[0].values.shape[1], height, width)
-        tap = 0
-        for level in levels:
-            result = out.view(batch, -1, level.rows, level.size, width)
-            values = level.wide[2]
-            for _, _, rows, cols in level.taps():
-                weight = logits[tap].view(batch, level.rows, level.size, width)
-                for k in range(result.shape[1]):
-                    result[:, k].addcmul_(weight, values[:, k, rows, None, cols])
-                tap += 1
+        out, logits = _filter(levels, target, preference)
         ctx.save_for_backward(target, logits, out, *cells)
         ctx.sizes, ctx.windows = sizes, windows
         return out
@@ -194,6 +210,9 @@ def affinity_filter(
     -------
     (B, C, H, W) means over the reached sources; 0 where no source is in reach.
     """
+    # Only differences of features count, and |f_t - f_s|^2 is computed as |f_t|^2 - 2 f_t f_s + |f_s|^2: what all
+    # features have in common would only cost digits.
+    features = features - features.detach().mean((2, 3), keepdim=True)
     height, width = log_n.shape[-2:]
     size = 2 ** (len(windows) - 1)
     pad = (0, math.ceil(width / size) * size - width, 0, math.ceil(height / size) * size - height)
@@ -209,5 +228,13 @@ def affinity_filter(
         bias, means = pool_cells(biased, planes, cell)
         feature, value = torch.split(means, [features.shape[1], values.shape[1]], 1)
         cells += [bias - feature.square().sum(1), feature, value]
-    apply: Callable[..., Tensor] = _AffinityFilter.apply
-    return apply(features, target_preference, sizes, tuple(windows), *cells)[..., :height, :width]
+    if torch.is_grad_enabled():
+        apply: Callable[..., Tensor] = _AffinityFilter.apply
+        return apply(features, target_preference, sizes, tuple(windows), *cells)[..., :height, :width]
+    levels, step = _levels(sizes, windows, cells), max(size, BAND_ROWS // size * size)
+    out = torch.empty_like(values)
+    for first in range(0, values.shape[-2], step):
+        rows = slice(first, min(first + step, values.shape[-2]))
+        band = [level.band(rows.start, rows.stop) for level in levels]
+        out[:, :, rows] = _filter(band, features[:, :, rows], target_preference[:, :, rows])[0]
+    return out[..., :height, :width]

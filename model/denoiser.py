@@ -16,7 +16,7 @@ from model.compositing import Layers, composite, fill_holes, to_layers
 from model.config import Config
 from model.direct import filter_direct, make_generators, splat_samples
 from model.features import FrameScale, log_radiance
-from model.guided import filter_guided, generator_sizes, guide_values, initial_guides, predict
+from model.guided import GUIDED_COLUMNS, filter_guided, generator_sizes, guide_values, initial_guides, predict
 from model.networks import Mlp, Products, UNet
 from model.partition import PRIOR_WINDOW, basic_values, initial_logits, kept_logits, relative_depth, splat
 from model.reach import influence
@@ -181,10 +181,10 @@ class Denoiser(nn.Module):
         for part, rows, part_relative in _chunks(samples, relative):
             if len(part.weight) < len(samples.weight):  # of several chunks: cheaper to repeat than to keep
                 embedding = self.reducer(part, scale)
-            planes.append(self._splat(part, embedding, part_relative, context[rows], scale, keep))
-            predictions.append(predict(self.generator, self.layer_bias[keep], planes[-1], context[rows]))
-        splats = _picture(planes, samples.shape).flatten(0, 1)
-        predicted = _picture(predictions, samples.shape).flatten(0, 1)
+            splats = self._splat(part, embedding, part_relative, context[rows], scale, keep)
+            predictions.append(predict(self.generator, self.layer_bias[keep], splats, context[rows]))
+            planes.append(splats[..., :GUIDED_COLUMNS].contiguous())  # the embedding has done its work
+        splats, predicted = (_picture(parts, samples.shape).flatten(0, 1) for parts in (planes, predictions))
         means = filter_guided(splats, predicted, self.guide_matrix, self.config)
         return composite(means.view(samples.shape[0], len(keep), *means.shape[1:]))
 

@@ -37,7 +37,7 @@ def _squash(pixels: Tensor) -> Tensor:
 
 def log_radiance(radiance: Tensor, exposure: float) -> Tensor:
     """log(1 + exposure * max(L, 0)): the network's view of radiance; negative radiance counts as 0 here only."""
-    return torch.log1p(radiance.clamp_min(0) * exposure)
+    return torch.log1p((radiance.clamp_min(0) * exposure).clamp_max(torch.finfo(radiance.dtype).max))
 
 
 def log_depth(depth: Tensor, median: float) -> Tensor:
@@ -65,7 +65,7 @@ def feature_groups(roles: Iterable[str], derived: bool) -> dict[str, int]:
 def encode(samples: Samples, scale: FrameScale, groups: Iterable[str]) -> dict[str, Tensor]:
     """Feature groups of those named that these samples have: name -> (N, width), all finite, 0 on a miss."""
     roles = samples.roles
-    hit = (samples.coverage > 0).to(roles["radiance"].dtype)[:, None]  # (N, 1)
+    hit = (samples.coverage > 0)[:, None]  # (N, 1)
     out: dict[str, Tensor] = {}
     for group in groups:
         if group == "radiance":
@@ -74,10 +74,10 @@ def encode(samples: Samples, scale: FrameScale, groups: Iterable[str]) -> dict[s
             out[group] = samples.coverage[:, None]
         elif group == "coc*lens":
             if "coc" in roles and "lens" in roles:
-                out[group] = _squash(roles["coc"] * roles["lens"]) * hit
+                out[group] = torch.where(hit, _squash(roles["coc"] * roles["lens"]), 0)
         elif group == "motion*time":
             if "motion" in roles and "time" in roles:
-                out[group] = _squash(roles["motion"] * (roles["time"] - 0.5)) * hit
+                out[group] = torch.where(hit, _squash(roles["motion"] * (roles["time"] - 0.5)), 0)
         elif group in roles:
             out[group] = _encode_role(group, roles[group], hit, scale)
     return out
@@ -85,14 +85,14 @@ def encode(samples: Samples, scale: FrameScale, groups: Iterable[str]) -> dict[s
 
 def _encode_role(role: str, values: Tensor, hit: Tensor, scale: FrameScale) -> Tensor:
     if role == "depth":
-        return log_depth(torch.where(hit > 0, values, scale.depth), scale.depth)
+        return log_depth(torch.where(hit, values, scale.depth), scale.depth)
     if role in ("motion", "coc"):
-        return _squash(values * hit)
+        return _squash(torch.where(hit, values, 0))
     if role == "lens":
         return values  # where the ray left the lens is known for a miss, too
     if role == "time":
         return values - 0.5
-    return values * hit
+    return torch.where(hit, values, 0)
 
 
 def divisor(samples: Samples) -> Tensor:

@@ -29,7 +29,9 @@ def guide_values(samples: Samples, scale: FrameScale) -> Tensor:
     """(N, 10) demodulated radiance, normal, log depth, divisor; 0 where a role is absent."""
     radiance = samples.roles["radiance"]
     hit, depth = hit_depth(samples, scale)
-    normal = samples.roles["normal"] * hit if "normal" in samples.roles else torch.zeros_like(radiance)
+    normal = torch.zeros_like(radiance)
+    if "normal" in samples.roles:
+        normal = torch.where(hit, samples.roles["normal"], normal)
     by = divisor(samples)
     return torch.cat([radiance / by, normal, log_depth(depth, scale.depth), by], 1)
 

@@ -75,9 +75,11 @@ class LayerSplat:
 
 
 def hit_depth(samples: Samples, scale: FrameScale) -> tuple[Tensor, Tensor]:
-    """(N, 1) 1 on a hit, and depth, the frame's median on a miss."""
-    hit = (samples.coverage > 0).to(samples.roles["radiance"].dtype)[:, None]
-    return hit, torch.where(hit > 0, samples.roles["depth"], scale.depth) if "depth" in samples.roles else hit
+    """(N, 1) whether a sample hit anything, and its depth: the median on a miss; without the role 1 on a hit."""
+    hit = (samples.coverage > 0)[:, None]
+    if "depth" not in samples.roles:
+        return hit, hit.to(samples.weight.dtype)
+    return hit, torch.where(hit, samples.roles["depth"], scale.depth)
 
 
 def basic_values(samples: Samples, scale: FrameScale) -> Tensor:

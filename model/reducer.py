@@ -12,6 +12,7 @@ from model.networks import Mlp
 from model.samples import Samples, Segments
 
 PIXEL_STATISTICS = 6  # log mean radiance (3), log spread of luminance, spread of relative depth, effective count
+LUMINANCE_LIMIT = 1e18  # its square must stay in the range of float32
 
 
 class SampleReducer(nn.Module):
@@ -81,7 +82,7 @@ def pixel_rows(
         deviation = embedding - segments.expand(mean)
         return torch.cat([mean, segments.weighted_sum(weight, deviation * deviation)[:, 0]], 1)
     radiance = samples.roles["radiance"]
-    luminance = radiance.mean(1, keepdim=True)
+    luminance = radiance.mean(1, keepdim=True).clamp(-LUMINANCE_LIMIT, LUMINANCE_LIMIT)
     offset = torch.zeros_like(luminance) if relative is None else relative
     moments = torch.cat([embedding, radiance, luminance, offset], 1)
     mean = segments.weighted_sum(weight, moments)[:, 0]

@@ -226,6 +226,14 @@ def test_extreme_radiance_weight_and_features_stay_finite(variant: str) -> None:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
+def test_a_firefly_near_the_end_of_single_precision_spoils_nothing(variant: str) -> None:
+    net = random_network(SMALL[variant], 15, torch.float32)
+    samples = random_samples(15, (1, 9, 9), 3, dtype=torch.float32)
+    samples.roles["radiance"][100] = 1e36
+    assert bool(planes(run(net, samples)).isfinite().all())
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
 def test_single_precision_is_close_to_the_reference_in_double(variant: str) -> None:
     samples = random_samples(10, (1, 14, 9), 3)
     reference = random_network(SMALL[variant], 10)

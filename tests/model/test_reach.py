@@ -12,6 +12,8 @@ from model.networks import UNet
 from model.reach import unet_span
 from tests.model.random_models import HALF_UNET, SMALL, UNET, random_network, random_samples, with_roles
 
+ROUNDING = 1e-13  # in float64
+
 
 def thin(unet: UNetConfig) -> UNetConfig:
     """The same network with one channel everywhere."""
@@ -55,7 +57,7 @@ def changed_radius(net: Denoiser, size: int, at: int) -> int:
         first = net(samples, FrameScale(), fill=False)
         second = net(with_roles(samples, **changed), FrameScale(), fill=False)
     difference = (first.color - second.color).abs().amax((0, 1, 2, 3))
-    touched = torch.nonzero(difference > 0)[:, 0]
+    touched = torch.nonzero(difference > ROUNDING * first.color.max())[:, 0]
     return int((touched - at).abs().max())
 
 

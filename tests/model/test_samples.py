@@ -1,0 +1,57 @@
+"""Segment reductions against loops over pixels, and what `Samples` refuses."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from model.samples import Samples, Segments
+
+
+def pieces(counts: list[int], values: Tensor) -> list[Tensor]:
+    return list(values.split(counts))
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.lists(st.integers(0, 4), min_size=1, max_size=8) | st.integers(1, 5).map(lambda n: [n] * 4))
+def test_reductions_equal_a_loop_over_pixels(counts: list[int]) -> None:
+    draw = torch.Generator().manual_seed(sum(counts))
+    values = torch.randn(sum(counts), 3, generator=draw, dtype=torch.float64)
+    weight = torch.rand(sum(counts), 2, generator=draw, dtype=torch.float64)
+    segments = Segments(torch.tensor(counts, dtype=torch.int32))
+    parts, weights = pieces(counts, values), pieces(counts, weight)
+    torch.testing.assert_close(segments.sum(values), torch.stack([part.sum(0) for part in parts]))
+    lowest = torch.full((3,), -math.inf, dtype=torch.float64)
+    expected = torch.stack([part.amax(0) if len(part) else lowest for part in parts])
+    torch.testing.assert_close(segments.max(values), expected)
+    products = torch.stack([own.T @ part for own, part in zip(weights, parts, strict=True)])
+    torch.testing.assert_close(segments.weighted_sum(weight, values), products)
+    numbered = torch.arange(len(counts), dtype=torch.float64)[:, None]
+    torch.testing.assert_close(segments.expand(numbered), numbered.repeat_interleave(torch.tensor(counts), 0))
+
+
+def samples(**changes: object) -> Samples:
+    fields: dict[str, object] = {
+        "shape": (1, 1, 2), "counts": torch.tensor([1, 2]), "weight": torch.tensor([1.0, 0.5, 0.5]),
+        "coverage": torch.ones(3), "roles": {"radiance": torch.ones(3, 3)},
+    }
+    return Samples(**{**fields, **changes})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"shape": (1, 2, 2)}, "2 counts for 1x2x2"),
+        ({"roles": {"depth": torch.ones(3, 1)}}, "radiance role is required"),
+        ({"roles": {"radiance": torch.ones(3, 3), "colour": torch.ones(3, 3)}}, "unknown role 'colour'"),
+        ({"roles": {"radiance": torch.ones(3, 1)}}, "role radiance"),
+    ],
+)
+def test_inconsistent_samples_are_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        samples(**changes)
