@@ -50,7 +50,7 @@ job_options = together(
         type=click.FloatRange(0.0, min_open=True),
         help="Scale of the radiance before the network.  [default: measured]",
     ),
-    option("--exposure-from", metavar="FRAME|FILE", help="Frame whose measured exposure serves all frames."),
+    option("--exposure-from", metavar="FRAME|FILE", help="Frame whose exposure and depth scale serve all."),
     reading_options,
 )
 """Frames, network and how the input is read."""

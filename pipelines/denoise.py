@@ -146,20 +146,18 @@ class Job:
         return FramePlan(source, seen, self.shot, roles, bands, needed, reader.mapping.lines())
 
     def _decide(self, seen: Survey, weighting: str) -> Shot:
+        """The shot's scale, both numbers of it, comes from one frame: chunks of a shot that name it agree exactly."""
         options = self.options
-        exposure = options.exposure
-        if exposure is None and options.exposure_from is not None:
-            exposure = self._measured_exposure(options.exposure_from)
-        if exposure is None:
-            exposure = seen.exposure
-        return Shot(FrameScale(exposure, seen.depth), options.layers or self.net.config.layers, weighting)
+        key = seen if options.exposure_from is None else self._survey_of(options.exposure_from)
+        scale = FrameScale(options.exposure or key.exposure, key.depth)
+        return Shot(scale, options.layers or self.net.config.layers, weighting)
 
-    def _measured_exposure(self, frame: str) -> float:
+    def _survey_of(self, frame: str) -> Survey:
         source = Path(frame)
         if frame.lstrip("-").isdigit() and not source.exists():
             source = sequences.frame_path(self.options.source, int(frame))
         with self.open(source) as reader:
-            return survey(reader.blocks()).exposure
+            return survey(reader.blocks())
 
     def frame(self, frame: sequences.Frame, progress: Progress) -> DenoisedFrame:
         """Denoises one frame. Raises FrameSkippedError, LbmcError."""

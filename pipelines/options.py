@@ -66,7 +66,7 @@ class DenoiseOptions:
     exposure: float | None = None
     """Factor that brings the radiance to the range the network was trained on. None: measured, see `exposure_from`."""
     exposure_from: str | None = None
-    """Frame (number or file) whose exposure is used for all. None: the first frame of a sequence."""
+    """Frame (number or file) whose measured exposure and depth scale serve all. None: the first frame of a sequence."""
     dry_run: bool = False
     """Say what would be done (frames, mapping, decisions, tile plan, memory) and write nothing."""
 
