@@ -137,6 +137,14 @@ class Denoiser(nn.Module):
 
     # --- samples to layers -----------------------------------------------------------------------------------------
 
+    def _splat_chunks(self, samples: Samples, embedding: Tensor, relative: Tensor | None, context: Tensor,
+                      scale: FrameScale, keep: list[int]) -> Iterator[tuple[slice, Tensor]]:
+        """Rows of pixels and their splat, chunk by chunk; `embedding` is used if it is that of all samples."""
+        for part, rows, part_relative in _chunks(samples, relative):
+            if len(part.weight) < len(samples.weight):  # of several chunks: cheaper to repeat than to keep
+                embedding = self.reducer(part, scale)
+            yield rows, self._splat(part, embedding, part_relative, context[rows], scale, keep)
+
     def _splat(self, samples: Samples, embedding: Tensor, relative: Tensor | None, context: Tensor, scale: FrameScale,
                keep: list[int]) -> Tensor:
         """(P, L, K) rows: log n, log w, then per unit of occupancy basic values, guides if needed, embedding."""
@@ -178,12 +186,9 @@ class Denoiser(nn.Module):
                          scale: FrameScale, keep: list[int]) -> Tensor:
         """(B, L, 6, H, W) visible planes."""
         planes, predictions = [], []
-        for part, rows, part_relative in _chunks(samples, relative):
-            if len(part.weight) < len(samples.weight):  # of several chunks: cheaper to repeat than to keep
-                embedding = self.reducer(part, scale)
-            splats = self._splat(part, embedding, part_relative, context[rows], scale, keep)
-            predictions.append(predict(self.generator, self.layer_bias[keep], splats, context[rows]))
-            planes.append(splats[..., :GUIDED_COLUMNS].contiguous())  # the embedding has done its work
+        for rows, part in self._splat_chunks(samples, embedding, relative, context, scale, keep):
+            predictions.append(predict(self.generator, self.layer_bias[keep], part, context[rows]))
+            planes.append(part[..., :GUIDED_COLUMNS].contiguous())  # the embedding has done its work
         splats, predicted = (_picture(parts, samples.shape).flatten(0, 1) for parts in (planes, predictions))
         means = filter_guided(splats, predicted, self.guide_matrix, self.config)
         return composite(means.view(samples.shape[0], len(keep), *means.shape[1:]))
@@ -191,11 +196,7 @@ class Denoiser(nn.Module):
     def _filter_direct(self, samples: Samples, embedding: Tensor, relative: Tensor | None, contexts: list[Tensor],
                        context: Tensor, scale: FrameScale, keep: list[int]) -> Tensor:
         """(B, L, 6, H, W) visible planes."""
-        planes = []
-        for part, rows, part_relative in _chunks(samples, relative):
-            if len(part.weight) < len(samples.weight):
-                embedding = self.reducer(part, scale)
-            planes.append(self._splat(part, embedding, part_relative, context[rows], scale, keep))
+        planes = [part for _, part in self._splat_chunks(samples, embedding, relative, context, scale, keep)]
         return filter_direct(_picture(planes, samples.shape), contexts, self.generators, self.config)
 
     def _splat_samples(self, samples: Samples, embedding: Tensor, context: Tensor, scale: FrameScale) -> Tensor:

@@ -252,6 +252,18 @@ def test_every_parameter_learns(variant: str) -> None:
     assert dead == []
 
 
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_radiance_alone_is_enough_and_so_is_no_sample_at_all(variant: str) -> None:
+    net = random_network(SMALL[variant], 16)
+    optional = [role for role in SMALL[variant].roles if role != "radiance"]
+    result = run(net, random_samples(16, (1, 5, 5), 2, optional))
+    assert bool(planes(result).isfinite().all())
+    assert float(result.color.min()) > 0
+    nothing = run(net, random_samples(16, (2, 5, 5), 0))
+    assert bool((planes(nothing) == 0).all())
+    assert bool((nothing.depth == torch.inf).all())
+
+
 def test_one_set_of_weights_serves_one_to_five_layers() -> None:
     net = random_network(SMALL["fast"], 12)
     samples = random_samples(12, (1, 10, 10), 4)
