@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from deep_io.atomic import atomic_output
-from deep_io.attributes import DEEP_IMAGE_STATES, Attribute, attribute
+from deep_io.attributes import Attribute, attribute
 from deep_io.deep_writer import DeepWriter
 from deep_io.errors import InputError
 from deep_io.flat import FlatImage, kept_attributes, write_flat_parts
@@ -24,6 +24,7 @@ from deep_io.layer_encoding import OverLayers, deep_samples, encode_layers
 from deep_io.path_samples import SampleReader
 from deep_io.roles import MISS_DEPTH
 from deep_io.sequences import Frame
+from deep_io.weighting import ATTRIBUTE as WEIGHTING_ATTRIBUTE
 from pipelines.denoise import DenoisedFrame, FramePlan, Job, run_job, to_pixel_type
 from pipelines.export_options import ExportOptions
 from pipelines.inference import FrameLayers
@@ -96,9 +97,9 @@ class ExportJob(Job):
         return clamped + clamped_too
 
     def _write_deep(self, target: Path, layers: FrameLayers, header: Header) -> int:
+        # No deepImageState: the OpenEXR module for Python cannot open a file that has it.
         attributes = {**kept_attributes(header), **self._attributes(len(layers.weight), "over"),
-                      "lbmc:weighting": attribute("over"),
-                      "deepImageState": attribute(DEEP_IMAGE_STATES.index("tidy"), "deepImageState")}
+                      WEIGHTING_ATTRIBUTE: attribute("over")}
         dtypes: dict[str, Any] = {**dict.fromkeys("RGBA", self._dtype), "Z": np.float32}
         deep = Header(channels_of(dtypes), header.data_window, header.display_window, pixel_aspect=header.pixel_aspect,
                       attributes=attributes)
