@@ -103,7 +103,8 @@ def _generate(generator: Mlp, context: Tensor, embedding: Tensor) -> Tensor:
     """context (B, C, h, w), embedding (B, L, E, h, w) -> (B*L, outputs, h, w)."""
     shared = generator.first(0, context.permute(0, 2, 3, 1))[:, None]  # (B, 1, h, w, hidden)
     mine = generator.first(1, embedding.permute(0, 1, 3, 4, 2))
-    return generator.rest(shared + mine).to(embedding.dtype).flatten(0, 1).permute(0, 3, 1, 2)
+    outputs = generator.rest(shared + mine).to(embedding.dtype).flatten(0, 1)
+    return outputs.permute(0, 3, 1, 2).contiguous()  # one plane per tap, as the filter reads them
 
 
 def splat_samples(samples: Samples, values: Tensor, embedding: Tensor, context: Tensor, generator: Mlp) -> Tensor:
@@ -128,8 +129,8 @@ def splat_samples(samples: Samples, values: Tensor, embedding: Tensor, context: 
             mine = generator.first(1, embedding[span])
             logits = generator.rest(segments.expand(shared[pixels]) + mine).to(values.dtype)
             log_n, mixed = mixture(logits + log_weight[span], values[span], segments)  # (p, T), (p, T, C)
-            log_n = log_n.view(1, last - first, width, -1).permute(0, 3, 1, 2)  # (1, T, h, w)
-            mixed = mixed.view(1, last - first, width, *mixed.shape[1:]).permute(0, 3, 4, 1, 2)  # (1, T, C, h, w)
+            log_n = log_n.view(1, last - first, width, -1).permute(0, 3, 1, 2).contiguous()  # (1, T, h, w)
+            mixed = mixed.view(1, last - first, width, *mixed.shape[1:]).permute(0, 3, 4, 1, 2).contiguous()
             unit = torch.zeros_like(log_n[:, 0])
             if merger is None:
                 results.append(kernel_filter(log_n, unit, mixed))
