@@ -1,0 +1,159 @@
+"""The rendering job behind `lbmc render`: which examples are missing, who renders them, what is told."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deep_io.errors import InputError, UsageError
+from pipelines.jobs import JobReport, run_frames
+from pipelines.progress import Progress, ProgressKind, make_progress
+from pipelines.rendering.backend import load_mitsuba
+from pipelines.rendering.contact import write_contact_sheet
+from pipelines.rendering.file_scene import FileTracer
+from pipelines.rendering.layouts import LAYOUTS
+from pipelines.rendering.output import example_files, write_example
+from pipelines.rendering.shots import RenderSettings, Shot, take_shot
+from pipelines.rendering.stage import Stage
+from pipelines.rendering.stage_scene import StageTracer
+from pipelines.rendering.tracer import SceneTracer
+
+CONTACT_SHEET = "contact-sheet.png"
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """What to render: `count` examples of the seeds from `seed` on, into the folder `outdir`.
+
+    scene     a Mitsuba scene file to take views of; None for random procedural scenes
+    workers   processes; each renders examples of its own
+    threads   threads of each process; None shares the cores between the workers
+    """
+
+    outdir: Path
+    count: int
+    seed: int = 1
+    settings: RenderSettings = field(default_factory=RenderSettings)
+    scene: Path | None = None
+    workers: int = 1
+    threads: int | None = None
+    contact_sheet: bool = True
+
+
+def example_stem(outdir: Path, seed: int) -> Path:
+    """The path of an example's files without their extensions."""
+    return outdir / f"scene{seed:06d}"
+
+
+def render_example(seed: int, settings: RenderSettings, scene: Path | None = None, threads: int = 0) -> Shot:
+    """One example in memory. Raises RendererMissingError, and InputError for a scene file that cannot be used."""
+    if scene is not None:
+        return take_shot(lambda rng: _file_tracer(scene, threads), seed, settings)
+    return take_shot(partial(_random_stage, seed, settings.layout, threads), seed, settings)
+
+
+@lru_cache(maxsize=1)
+def _file_tracer(scene: Path, threads: int) -> FileTracer:
+    return FileTracer(scene, threads)
+
+
+def _random_stage(seed: int, layout: str | None, threads: int, rng: np.random.Generator) -> SceneTracer:
+    names = list(LAYOUTS)
+    # Drawn by seed alone: were it redrawn at each attempt, the kinds that pass the pilot easily would take over.
+    share = [LAYOUTS[name][0] for name in names]
+    name = layout or str(np.random.default_rng(seed).choice(names, p=np.array(share) / sum(share)))
+    stage = Stage(rng)
+    LAYOUTS[name][1](stage)
+    return StageTracer(stage, threads)
+
+
+def render_and_write(options: RenderOptions, seed: int) -> str:
+    """Render and write the example of `seed`; a line that says how it came out. Runs in a worker, too."""
+    shot = render_example(seed, options.settings, options.scene, threads_per_worker(options))
+    stem = example_stem(options.outdir, seed)
+    write_example(stem, shot)
+    about = shot.about
+    return (f"{stem.name}: {about['kind']}, {', '.join(about['tags'])}, relMSE {about.get('relmse8', 0):.3f}, "
+            f"energy {about['energy']:.3f}, attempt {about['attempt'] + 1}")
+
+
+def threads_per_worker(options: RenderOptions) -> int:
+    """The threads asked for, or an equal share of the cores this process may use."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return options.threads or max(1, cores // options.workers)
+
+
+def render_scenes(options: RenderOptions, progress_kind: ProgressKind = "auto",
+                  report: Callable[[str], None] | None = None) -> JobReport[str]:
+    """Render every example of the options that is not there yet, then a contact sheet of all.
+
+    An example is NAME.deep.exr, NAME.ref.exr and NAME.json; its JSON comes last and marks it complete, so a job that
+    was stopped goes on where it was. `report` is told each example's line; the progress's notes by default.
+    Raises UsageError for settings that differ from those of examples already there, InputError for a bad scene file.
+    """
+    _check(options)
+    seeds = range(options.seed, options.seed + options.count)
+    missing = [seed for seed in seeds if not _is_complete(options, seed)]
+    with make_progress(progress_kind, len(missing)) as progress:
+        if len(missing) < len(seeds):
+            progress.note(f"{len(seeds) - len(missing)} of {len(seeds)} examples are there already")
+        with _renderer(options, missing) as render:
+            def work(seed: int, progress: Progress) -> str:
+                line = render(seed)
+                (report or progress.note)(line)
+                return line
+
+            done = run_frames(missing, work, progress, lambda seed: example_stem(options.outdir, seed).name)
+    complete = [example_stem(options.outdir, seed) for seed in seeds if _is_complete(options, seed)]
+    if options.contact_sheet and complete:
+        write_contact_sheet(options.outdir / CONTACT_SHEET, complete)
+    return done
+
+
+@contextmanager
+def _renderer(options: RenderOptions, seeds: list[int]) -> Iterator[Callable[[int], str]]:
+    """A function from seed to line: here, or in a pool that is already at work on all seeds."""
+    if options.workers <= 1 or len(seeds) <= 1:
+        yield partial(render_and_write, options)
+        return
+    # Spawned, not forked: Dr.Jit's threads do not survive a fork.
+    pool = ProcessPoolExecutor(options.workers, multiprocessing.get_context("spawn"))
+    try:
+        futures: dict[int, Future[str]] = {seed: pool.submit(render_and_write, options, seed) for seed in seeds}
+        yield lambda seed: futures[seed].result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _check(options: RenderOptions) -> None:
+    load_mitsuba(threads_per_worker(options) if options.workers <= 1 else 1)
+    if options.scene is not None and not options.scene.is_file():
+        raise InputError(f"{options.scene}: no such scene file")
+    if options.settings.size % 4 or options.settings.size < 16:
+        raise UsageError(f"a size of {options.settings.size} pixels: give a multiple of 4, at least 16")
+    if options.settings.layout not in (None, *LAYOUTS):
+        raise UsageError(f"no layout {options.settings.layout!r}; there are {', '.join(LAYOUTS)}")
+    if options.outdir.exists() and not options.outdir.is_dir():
+        raise UsageError(f"{options.outdir}: is a file; name a folder for the examples")
+    options.outdir.mkdir(parents=True, exist_ok=True)
+
+
+def _is_complete(options: RenderOptions, seed: int) -> bool:
+    """Whether the example is there. Raises UsageError when it is, but rendered otherwise."""
+    *_, about_path = files = example_files(example_stem(options.outdir, seed))
+    if not all(path.exists() for path in files):
+        return False
+    about: dict[str, Any] = json.loads(about_path.read_text())
+    if about.get("settings") != asdict(options.settings):
+        raise UsageError(f"{about_path}: was rendered with other settings; choose another folder or other seeds")
+    return True

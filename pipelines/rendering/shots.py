@@ -1,0 +1,215 @@
+"""One training example: a random view of a random scene, its path samples and an independent reference.
+
+A cheap pilot picture turns down scenes that are black, flat, without noise or nothing but noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from model.metrics import EPSILON, common_scale, score
+from pipelines.rendering.patterns import join, make_pattern, shuffle_order
+from pipelines.rendering.tracer import TIME_BINS, SceneTracer
+from pipelines.rendering.views import View, add_camera_motion, add_defocus, choose_view, draw_object_motions
+
+Array = npt.NDArray[np.float32]
+
+ATTEMPTS = 12
+# Scenes are scaled so that the metrics' exposure is 1, then by a random factor. Paths brighter than CLAMP at that
+# exposure, where the middling brightness is 0.5, are cut alike in samples and reference: else references of some
+# hundred samples would be mostly fireflies.
+CLAMP = 60.0
+BRIGHTNESS_STOPS = 1.5  # standard deviation
+# relMSE of eight samples, estimated from a pilot: easier scenes teach little, harder ones are noise alone.
+EASIEST, EASY, HARDEST = 0.05, 0.25, 2.5
+EASY_KEPT = 0.5
+LIT, CONTRAST = 0.75, 0.08  # least share of surfaces that any path lights, least deviation of log brightness
+PILOT, PILOT_SAMPLES = 64, 16
+
+DEFOCUS_SHARE, MOTION_SHARE, STRATIFIED_SHARE, BLACK_SHARE = 0.5, 0.5, 0.5, 0.15
+OBJECTS_SHARE, BOTH_SHARE = 0.55, 0.25  # of the scenes with motion: objects move; objects and camera move
+REFERENCE_PASS = 32
+JOINT_REFERENCE = 128  # up to here samples and reference of moving objects share one sweep over the shutter
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """How a scene is sampled.
+
+    `samples` stored per pixel, `reference` paths per pixel of the target, `size` pixels square (a multiple of 4).
+    `layout` names one kind of scene; `defocus` and `motion` True or False force or forbid it, None leaves it to chance.
+    """
+
+    samples: int = 32
+    reference: int = 128
+    size: int = 192
+    layout: str | None = None
+    defocus: bool | None = None
+    motion: bool | None = None
+
+
+@dataclass(frozen=True)
+class Shot:
+    """`channels`: canonical name -> (N,), N = size^2 * samples, pixel-major; `reference` (size, size, 4) RGBA."""
+
+    channels: dict[str, Array]
+    reference: Array
+    about: dict[str, Any]
+
+
+def take_shot(load: Callable[[np.random.Generator], SceneTracer], seed: int, settings: RenderSettings) -> Shot:
+    """The example of `seed`, drawn again, at most ATTEMPTS times, until its pilot is worth rendering.
+
+    `load` makes a random scene. The same seed, settings and versions give the same example on the same processor.
+    """
+    for attempt in range(ATTEMPTS):
+        rng = np.random.default_rng([seed, attempt])
+        tracer = load(rng)
+        try:
+            view = choose_view(tracer, rng, settings.size)
+            view = add_defocus(view, rng) if _decide(settings.defocus, DEFOCUS_SHARE, rng) else view
+            black = bool(rng.random() < BLACK_SHARE)
+            if attempt < ATTEMPTS - 1 and not _worth(tracer, view, black, rng):
+                continue
+            view = _add_motion(tracer, view, rng) if _decide(settings.motion, MOTION_SHARE, rng) else view
+            shot = _expose(tracer, view, black, rng, settings)
+            return replace(shot, about={"seed": seed, "attempt": attempt, **shot.about})
+        finally:
+            tracer.close()
+    raise AssertionError("the last attempt is always kept")
+
+
+def _decide(forced: bool | None, share: float, rng: np.random.Generator) -> bool:
+    drawn = bool(rng.random() < share)
+    return drawn if forced is None else forced
+
+
+def estimated_noise(radiance: Array, samples: int = 8) -> float:
+    """relMSE that `samples` of the paths (P, S, 3) would have, from their variance. P is a square picture, side 4k.
+
+    Pixels of rare bright paths are black in their own mean, so the denominator comes from blocks of 4 x 4 pixels.
+    """
+    size = round(len(radiance) ** 0.5)
+    mean = radiance.mean(1).reshape(size, size, 3)
+    scale = _exposure(mean)
+    rough = mean.reshape(size // 4, 4, size // 4, 4, 3).mean((1, 3)).repeat(4, 0).repeat(4, 1).reshape(-1, 3) * scale
+    variance = radiance.var(1, ddof=1) * scale**2
+    return float((variance / samples / (rough**2 + EPSILON)).mean())
+
+
+def _worth(tracer: SceneTracer, view: View, black: bool, rng: np.random.Generator) -> bool:
+    """Whether a scene teaches, by a small still picture."""
+    pattern = make_pattern(rng, PILOT**2, PILOT_SAMPLES, False, None)
+    channels = tracer.trace(view.camera.resized(PILOT), pattern, int(rng.integers(2**31)), features="coverage")
+    _clean(channels, black)
+    radiance = _stack(channels, PILOT_SAMPLES)
+    hit = channels["A"].reshape(-1, PILOT_SAMPLES).any(1)
+    image = radiance.mean(1)
+    if not hit.any() or (image[hit].mean(1) > 0).mean() < LIT:
+        return False
+    scale = _exposure(image.reshape(PILOT, PILOT, 3))
+    noise = estimated_noise(np.minimum(radiance, CLAMP / scale))
+    if np.log1p(image.mean(1) * scale).std() < CONTRAST or not EASIEST < noise < HARDEST:
+        return False
+    return noise > EASY or bool(rng.random() < EASY_KEPT)
+
+
+def _add_motion(tracer: SceneTracer, view: View, rng: np.random.Generator) -> View:
+    """Objects move, or the camera, or both; the camera also where nothing in view can move."""
+    which = rng.random()
+    moved = draw_object_motions(view, tracer.movable(), rng) if which < OBJECTS_SHARE else {}
+    if moved:
+        tracer.set_motions(moved)
+        view = replace(view, object_motion=True)
+    return view if moved and which >= BOTH_SHARE else add_camera_motion(view, rng)
+
+
+def _expose(tracer: SceneTracer, view: View, black: bool, rng: np.random.Generator, settings: RenderSettings) -> Shot:
+    """Trace samples and reference, bring both to one exposure and put the samples in a fair order."""
+    n, size = settings.samples, settings.size
+    stratified = bool(rng.random() < STRATIFIED_SHARE)
+    channels, passes = _trace(tracer, view, stratified, rng, settings)
+    order = shuffle_order(rng, size**2, n)
+    channels = {name: values[order] for name, values in channels.items()}
+    broken = _clean(channels, black) + sum(_clean(part, black) for part in passes)
+    noisy = _stack(channels, n).mean(1).reshape(size, size, 3)
+    scale = _exposure(noisy)
+    brightness = float(np.exp2(rng.normal(0, BRIGHTNESS_STOPS)))
+    for part in (channels, *passes):
+        for c in "RGB":
+            part[c] = np.minimum(part[c] * np.float32(scale), CLAMP) * np.float32(brightness)
+    means = [np.stack([part[c].reshape(size, size, -1).mean(2, dtype=np.float64) for c in "RGBA"], -1)
+             for part in passes]
+    reference = np.mean(means, 0).astype(np.float32)
+    about = tracer.describe() | {
+        "settings": asdict(settings), "defocus": view.defocus, "camera_motion": view.camera_motion,
+        "object_motion": view.object_motion, "stratified": stratified, "black_background": black,
+        "brightness": brightness, "non_finite_paths": broken, **_measure(channels, reference, n)}
+    return Shot(channels, reference, about)
+
+
+def _trace(tracer: SceneTracer, view: View, stratified: bool, rng: np.random.Generator,
+           settings: RenderSettings) -> tuple[dict[str, Array], list[dict[str, Array]]]:
+    """The samples' channels and, for each pass of the reference, its R, G, B and A; all (N,), pixel-major."""
+    pixels, n, reference = settings.size**2, settings.samples, settings.reference
+    bins = TIME_BINS if tracer.moving else None
+    seeds = [int(s) for s in rng.integers(2**31, size=2)]
+    pattern = make_pattern(rng, pixels, n, stratified, bins)
+    if tracer.moving and reference <= JOINT_REFERENCE:
+        # Every time bin rebuilds the scene, so both share one sweep; each path has random numbers of its own.
+        target = make_pattern(rng, pixels, reference, stratified, bins)
+        both = tracer.trace(view.camera, join(pattern, target), seeds[0])
+        tables = {name: values.reshape(pixels, -1) for name, values in both.items()}
+        return ({name: table[:, :n].ravel() for name, table in tables.items()},
+                [{name: tables[name][:, n:].ravel() for name in "RGBA"}])
+    channels = tracer.trace(view.camera, pattern, seeds[0], stratified)
+    count = max(1, round(reference / (JOINT_REFERENCE if tracer.moving else REFERENCE_PASS)))
+    shares = [reference // count + (k < reference % count) for k in range(count)]
+    parts = [tracer.trace(view.camera, make_pattern(rng, pixels, share, stratified, bins), seeds[1] + k, stratified,
+                          "coverage") for k, share in enumerate(shares)]
+    return channels, parts
+
+
+def _exposure(image: Array) -> float:
+    """The metrics' scale; 1 for a picture too dark to have one."""
+    try:
+        return common_scale(image)
+    except ValueError:
+        return 1.0
+
+
+def _stack(channels: dict[str, Array], samples: int) -> Array:
+    """Radiance (P, S, 3)."""
+    return np.stack([channels[c] for c in "RGB"], -1).reshape(-1, samples, 3)
+
+
+def _clean(channels: dict[str, Array], black: bool) -> int:
+    """Zero non-finite radiance in place, and that of misses if the background is to be black. Count the former."""
+    bad = ~np.isfinite(channels["R"] + channels["G"] + channels["B"])
+    for c in "RGB":
+        channels[c][bad] = 0.0
+        if black:
+            channels[c] *= channels["A"]
+    return int(bad.sum())
+
+
+def _measure(channels: dict[str, Array], reference: Array, samples: int) -> dict[str, float]:
+    """How hard the example is: errors of its first eight samples, and how far it is blurred."""
+    radiance, target = _stack(channels, samples), reference[..., :3]
+    hit = channels["A"] > 0
+
+    def percentile_95(values: Array) -> float:
+        return float(np.quantile(values[hit], 0.95)) if hit.any() else 0.0
+
+    about = {"coverage": float(hit.mean()), "coc_95": percentile_95(np.abs(channels["coc"])),
+             "motion_95": percentile_95(np.hypot(channels["motion.X"], channels["motion.Y"])),
+             "energy": float(radiance.mean() / max(float(target.mean()), 1e-12))}
+    if float(np.percentile(target, 99)) > 0:
+        noisy = score(radiance[:, :8].mean(1).reshape(target.shape), target, with_flip=False)
+        about |= {"relmse8": noisy.relmse, "relmse8_trimmed": noisy.relmse_trimmed, "smape8": noisy.smape}
+    return about

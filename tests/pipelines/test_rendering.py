@@ -1,0 +1,302 @@
+"""Rendered examples: the conventions of the deep sample file, unbiasedness, determinism, resuming, the command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+pytest.importorskip("mitsuba")
+
+from deep_io import read_deep
+from deep_io.errors import InputError, UsageError
+from deep_io.flat import read_flat
+from pipelines.rendering import environment
+from pipelines.rendering import geometry as g
+from pipelines.rendering.camera import Camera
+from pipelines.rendering.job import RenderOptions, render_example, render_scenes
+from pipelines.rendering.patterns import make_pattern
+from pipelines.rendering.shots import RenderSettings, estimated_noise
+from pipelines.rendering.stage import Stage
+from pipelines.rendering.stage_scene import StageTracer
+from pipelines.rendering.tracer import MISS_DEPTH, TIME_BINS, Motion
+from tests.runner import in_process
+
+Array = npt.NDArray[np.float32]
+
+SIZE = 32
+HALF_WIDTH = 2.0  # of the wall that the camera looks at
+SMALL = RenderSettings(samples=4, reference=4, size=SIZE, layout="tabletop")
+
+SCENE = """<scene version="3.0.0">
+  <sensor type="perspective"><float name="fov" value="50"/>
+    <transform name="to_world"><lookat origin="0,1,4" target="0,0.5,0" up="0,1,0"/></transform></sensor>
+  <emitter type="constant"><rgb name="radiance" value="0.3"/></emitter>
+  <shape type="sphere"><point name="center" x="0.5" y="2.5" z="1"/><float name="radius" value="0.1"/>
+    <emitter type="area"><rgb name="radiance" value="60"/></emitter></shape>
+  <shape type="rectangle"><transform name="to_world"><scale value="4"/><rotate x="1" angle="-90"/></transform>
+    <bsdf type="diffuse"><rgb name="reflectance" value="0.6,0.2,0.1"/></bsdf></shape>
+  <shape type="cube"><transform name="to_world"><scale value="0.4"/><translate y="0.4"/></transform>
+    <bsdf type="roughconductor"><float name="alpha" value="0.09"/></bsdf></shape>
+</scene>
+"""
+
+
+def wall_stage(height: float = 0.0) -> Stage:
+    """A wall at z = 0 whose colour is its position: red = x, green = y, over -HALF_WIDTH..HALF_WIDTH."""
+    stage = Stage(np.random.default_rng(0))
+    side = 2 * HALF_WIDTH
+    wall = g.quad([-HALF_WIDTH, -HALF_WIDTH, height], [side, 0, 0], [0, side, 0])
+    color = np.concatenate([(wall.vertices[:, :2] + HALF_WIDTH) / side, np.full((4, 1), 0.5)], 1).astype(np.float32)
+    stage.add(g.Mesh(wall.vertices, wall.faces, wall.uv, color), stage.material("colored"))
+    stage.environment = environment.uniform(np.random.default_rng(0), 1.0)
+    stage.camera = lambda rng: Camera.look_at([0, 0, 3], [0, 0, 0], 60)
+    return stage
+
+
+def trace(stage: Stage, camera: Camera, samples: int, motions: dict[int, Motion] | None = None,
+          seed: int = 1) -> tuple[dict[str, Array], Array, Array]:
+    """The channels as (P, S) tables, and the pixel positions (P, S) at which the paths started."""
+    tracer = StageTracer(stage, threads=1)
+    tracer.set_motions(motions or {})
+    pattern = make_pattern(np.random.default_rng(seed), camera.size**2, samples, False, TIME_BINS if motions else None)
+    channels = tracer.trace(camera, pattern, seed)
+    tracer.close()
+    pixel = np.arange(camera.size**2)[:, None]
+    x, y = pixel % camera.size + pattern.jitter_x, pixel // camera.size + pattern.jitter_y
+    return {name: values.reshape(-1, samples) for name, values in channels.items()}, x, y
+
+
+def pinhole(camera: Camera, point: Array) -> tuple[Array, Array]:
+    """Pixel positions of world points (..., 3) in the camera's middle pose, in NumPy and from the definition."""
+    v = point - camera.origin
+    z = v @ camera.forward
+    return (camera.size / 2 + camera.focal * (v @ camera.right) / z,
+            camera.size / 2 - camera.focal * (v @ camera.up) / z)
+
+
+def test_depth_is_planar_normals_face_the_camera_and_misses_are_empty() -> None:
+    camera = Camera.look_at([0, 0, 3], [0, 0, 0], 80).resized(SIZE)
+    channels, _, _ = trace(wall_stage(), camera, 4)
+    hit = channels["A"] == 1
+    assert 0.3 < hit.mean() < 0.9
+    np.testing.assert_allclose(channels["Z"][hit], 3.0, rtol=1e-5)
+    for name, value in {"N.X": 0.0, "N.Y": 0.0, "N.Z": 1.0, "roughness": 1.0, "specular.R": 0.0}.items():
+        np.testing.assert_allclose(channels[name][hit], value, atol=1e-5)
+    assert (channels["Z"][~hit] == np.float32(MISS_DEPTH)).all()
+    for name in ("N.X", "N.Z", "albedo.R", "motion.X", "coc"):
+        assert (channels[name][~hit] == 0).all()
+
+
+@pytest.mark.parametrize("moves", ["nothing", "camera", "object", "both"])
+def test_pixel_is_pinhole_projection_plus_motion_minus_coc_times_lens(moves: str) -> None:
+    """The wall's colour tells where it was hit, so the identity is checked through the whole renderer."""
+    camera = Camera.look_at([0.4, 0.2, 3], [0, 0.1, 0], 45, roll=0.3).resized(SIZE).with_lens(6.0, 1.5)
+    if moves in ("camera", "both"):
+        camera = Camera(**{**vars(camera), "shift": np.array([0.05, -0.03, 0.0]), "turn": np.array([0.0, 0.01, 0.02])})
+    motions = {0: Motion(np.array([0.2, 0.1, 0.0]), np.zeros(3), np.zeros(3))} if moves in ("object", "both") else None
+    channels, x, y = trace(wall_stage(), camera, TIME_BINS, motions)
+    hit = channels["A"] == 1
+    assert hit.mean() > 0.9
+    width = 2 * HALF_WIDTH
+    rest = np.stack([channels["albedo.R"] * width - HALF_WIDTH, channels["albedo.G"] * width - HALF_WIDTH,
+                     np.zeros_like(x)], -1)
+    there_x, there_y = pinhole(camera, rest)
+    late = channels["time"] - 0.5
+    found_x = there_x + channels["motion.X"] * late - channels["coc"] * channels["lens.X"]
+    found_y = there_y + channels["motion.Y"] * late - channels["coc"] * channels["lens.Y"]
+    # Motion along the screen is not quite linear in time, hence the wider bound where something moves.
+    bound = 0.005 if moves == "nothing" else 0.15
+    assert np.abs(found_x - x)[hit].max() < bound
+    assert np.abs(found_y - y)[hit].max() < bound
+    assert np.abs(channels["coc"][hit]).max() > 2
+    if moves != "nothing":
+        assert np.hypot(channels["motion.X"], channels["motion.Y"])[hit].mean() > 0.5
+
+
+def test_coc_is_positive_behind_the_focus_plane_and_zero_on_it() -> None:
+    for height, sign in ((0.0, 1), (1.0, 0), (1.5, -1)):
+        camera = Camera.look_at([0, 0, 3], [0, 0, 0], 40).resized(SIZE).with_lens(5.0, 2.0)
+        channels, _, _ = trace(wall_stage(height), camera, 1)
+        coc = channels["coc"][channels["A"] == 1]
+        assert (np.sign(np.round(coc, 4)) == sign).all()
+
+
+def busy_stage() -> Stage:
+    """A few shiny things on a floor under a sky, in front of empty background."""
+    stage = Stage(np.random.default_rng(3))
+    rng = stage.rng
+    stage.add(g.quad([-3, 0, -3], [0, 0, 6], [6, 0, 0]), stage.material("matte", texture=stage.textured("checker")))
+    for k, kind in enumerate(("plastic", "metal", "matte", "cutout")):
+        slot = stage.material(kind, **({} if kind == "metal" else {"texture": stage.textured()}))
+        stage.add(g.superellipsoid([0.8] * 3), slot, [0.9 * k - 1.4, 0.4, float(rng.normal()) * 0.3], movable=True)
+    stage.environment = environment.sky(np.random.default_rng(2), [0.3, 1.0, 0.4])
+    stage.camera = lambda rng: Camera.look_at([0, 1.5, 4], [0, 0.3, 0], 40)
+    return stage
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_samples_and_reference_have_one_expectation(moving: bool) -> None:
+    """Two independent estimates of every block of pixels differ as their variances say, with no bias."""
+    camera = Camera.look_at([0, 1.5, 4], [0, 0.3, 0], 40).resized(SIZE).with_lens(3.0, 3.5)
+    motions = {2: Motion(np.array([0.3, 0.1, 0.0]), np.array([0.0, 0.5, 0.0]), np.array([-0.5, 0.4, 0.0]))}
+    tables = [trace(busy_stage(), camera, samples, motions if moving else None, seed)[0]
+              for samples, seed in ((32, 11), (64, 12))]
+    means, variances = [], []
+    for table in tables:
+        light = np.minimum(table["R"] + table["G"] + table["B"], 60.0).astype(np.float64)
+        blocks = light.reshape(SIZE // 8, 8, SIZE // 8, 8, -1).transpose(0, 2, 1, 3, 4).reshape(16, 64, -1)
+        means.append(blocks.mean((1, 2)))
+        variances.append((blocks.var(2, ddof=1) / blocks.shape[2]).sum(1) / 64**2)
+    z = (means[0] - means[1]) / np.sqrt(variances[0] + variances[1])
+    assert np.abs(z).max() < 4.5
+    assert abs(float(z.mean())) < 4 / np.sqrt(len(z))
+    # Both contain noise, or the test could not fail.
+    assert np.std(z) > 0.3
+
+
+def test_stored_samples_agree_with_the_stored_reference() -> None:
+    shot = render_example(5, RenderSettings(samples=32, reference=64, size=SIZE, layout="outdoor"), threads=1)
+    radiance = np.stack([shot.channels[c] for c in "RGB"], -1).reshape(SIZE**2, 32, 3).astype(np.float64)
+    reference = shot.reference[..., :3].reshape(-1, 3).astype(np.float64)
+    spread = np.sqrt((radiance.var(1, ddof=1) * (1 / 32 + 1 / 64)).sum()) / radiance.shape[0] / 3
+    assert abs(radiance.mean() - reference.mean()) < 5 * np.sqrt(3) * spread
+    coverage = shot.channels["A"].reshape(SIZE, SIZE, 32).mean(2)
+    assert np.abs(coverage - shot.reference[..., 3]).mean() < 0.05
+    assert shot.about["energy"] == pytest.approx(radiance.mean() / reference.mean(), rel=1e-3)
+
+
+def test_a_seed_gives_the_same_example_every_time_and_another_seed_another() -> None:
+    first, again, other = (render_example(seed, SMALL, threads=1) for seed in (2, 2, 3))
+    for name, values in first.channels.items():
+        np.testing.assert_array_equal(values, again.channels[name])
+    np.testing.assert_array_equal(first.reference, again.reference)
+    assert first.about == again.about
+    assert not np.array_equal(first.reference, other.reference)
+
+
+def test_defocus_and_motion_can_be_forced_and_forbidden() -> None:
+    still = render_example(4, RenderSettings(4, 4, SIZE, "tabletop", defocus=False, motion=False), threads=1)
+    assert not still.about["defocus"]
+    assert still.about["coc_95"] == still.about["motion_95"] == 0
+    moved = render_example(4, RenderSettings(4, 4, SIZE, "tabletop", defocus=True, motion=True), threads=1)
+    assert moved.about["defocus"]
+    assert moved.about["camera_motion"] or moved.about["object_motion"]
+    assert moved.about["coc_95"] > 0.5
+    assert moved.about["motion_95"] > 0.2
+
+
+def test_estimated_noise_is_that_of_fewer_samples() -> None:
+    rng = np.random.default_rng(1)
+    paths = (0.5 + rng.normal(0, 0.2, (16 * 16, 400, 3))).astype(np.float32)
+    eight = paths[:, :8].mean(1)
+    measured = float(((eight - 0.5) ** 2 / (0.5**2 + 0.01)).mean())
+    assert estimated_noise(paths) == pytest.approx(measured, rel=0.15)
+
+
+def options(folder: Path, **more: object) -> RenderOptions:
+    return RenderOptions(folder, **{"count": 2, "seed": 2, "settings": SMALL, "threads": 1, **more})  # type: ignore[arg-type]
+
+
+def test_a_job_goes_on_where_it_was_stopped(tmp_path: Path) -> None:
+    report = render_scenes(options(tmp_path), "none")
+    assert report.exit_code == 0
+    assert len(report.values) == 2
+    files = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert {path.name for path in files} == {"contact-sheet.png"} | {
+        f"scene00000{seed}{end}" for seed in (2, 3) for end in (".deep.exr", ".ref.exr", ".json")}
+    times = {path: path.stat().st_mtime_ns for path in files}
+    # Without its JSON an example is incomplete, whatever else is there.
+    (tmp_path / "scene000003.json").unlink()
+    again = render_scenes(options(tmp_path), "none")
+    assert [frame.label for frame in again.frames] == ["scene000003"]
+    for path, content in files.items():
+        assert path.read_bytes() == content
+        assert (path.stat().st_mtime_ns == times[path]) == ("000002" in path.name)
+
+
+def test_files_hold_the_canonical_channels(tmp_path: Path) -> None:
+    render_scenes(options(tmp_path, count=1, contact_sheet=False), "none")
+    samples, header = read_deep(tmp_path / "scene000002.deep.exr")
+    assert (samples.counts == 4).all()
+    assert set(header.channel_names) == {
+        *"RGBAZ", "N.X", "N.Y", "N.Z", "roughness", "motion.X", "motion.Y", "coc", "lens.X", "lens.Y", "time",
+        *(f"{role}.{c}" for role in ("albedo", "specular") for c in "RGB")}
+    assert {channel.name: channel.dtype for channel in header.channels}["Z"] == np.float32
+    assert all(np.isfinite(values.astype(np.float32)).all() for values in samples.channels.values())
+    reference = read_flat(tmp_path / "scene000002.ref.exr").channels
+    assert set(reference) == set("RGBA")
+    assert all(np.isfinite(values).all() for values in reference.values())
+    about = json.loads((tmp_path / "scene000002.json").read_text())
+    assert about["kind"] == "tabletop"
+
+
+def test_other_settings_do_not_mix_with_what_is_there(tmp_path: Path) -> None:
+    render_scenes(options(tmp_path, count=1, contact_sheet=False), "none")
+    with pytest.raises(UsageError, match="other settings"):
+        render_scenes(options(tmp_path, count=1, settings=RenderSettings(8, 4, SIZE, "tabletop")), "none")
+
+
+def test_workers_give_the_same_examples_as_one_process(tmp_path: Path) -> None:
+    for folder, workers in (("one", 1), ("two", 2)):
+        report = render_scenes(options(tmp_path / folder, workers=workers, contact_sheet=False), "none")
+        assert report.exit_code == 0
+    for path in (tmp_path / "one").iterdir():
+        assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
+
+
+def test_a_scene_file_gives_views_with_features_and_motion(tmp_path: Path) -> None:
+    scene = tmp_path / "room.xml"
+    scene.write_text(SCENE)
+    settings = RenderSettings(8, 8, SIZE, defocus=True, motion=True)
+    shots = [render_example(seed, settings, scene, threads=1) for seed in (1, 2, 1)]
+    for shot in shots:
+        hit = shot.channels["A"] > 0
+        assert shot.about["kind"] == "file"
+        assert shot.about["motion_95"] > 0.2
+        assert np.isfinite(shot.reference).all()
+        floor = hit & (shot.channels["roughness"] == 1) & (shot.channels["albedo.R"] > 0)
+        np.testing.assert_allclose(shot.channels["albedo.R"][floor], 0.6, atol=1e-3)
+        metal = hit & (np.abs(shot.channels["roughness"] - 0.3) < 1e-3)
+        assert (shot.channels["albedo.R"][metal] == 0).all()
+        assert (shot.channels["specular.R"][metal] > 0.5).all()
+    # The scene stays loaded between views; what moved must be back in its place.
+    np.testing.assert_array_equal(shots[0].reference, shots[2].reference)
+
+
+@pytest.mark.parametrize(("text", "complaint"), [
+    ("<scene version='3.0.0'><shape type='nonsense'/></scene>", "not a scene that Mitsuba can load"),
+    ("<scene version='3.0.0'><shape type='sphere'/></scene>", "no lights"),
+    ("not XML", "not a scene that Mitsuba can load"),
+])
+def test_an_unfit_scene_file_is_refused_by_name(tmp_path: Path, text: str, complaint: str) -> None:
+    scene = tmp_path / "bad.xml"
+    scene.write_text(text)
+    with pytest.raises(InputError, match=complaint) as refused:
+        render_example(1, SMALL, scene, threads=1)
+    assert str(scene) in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_the_command_renders_and_reports(tmp_path: Path) -> None:
+    run = in_process("render", tmp_path / "out", "--count", 1, "--seed", 2, "--samples", 4, "--reference", 4,
+                     "--size", SIZE, "--layout", "tabletop", "--threads", 1, "--progress", "plain")
+    assert run.code == 0, run.err
+    assert "Progress: 100%" in run.err
+    assert (tmp_path / "out" / "contact-sheet.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(("arguments", "code", "complaint"), [
+    (["--layout", "cellar"], 2, "interior"),
+    (["--size", 33], 2, "multiple of 4"),
+    (["--scene", "nowhere.xml"], 3, "nowhere.xml"),
+])
+def test_the_command_refuses_in_one_line(tmp_path: Path, arguments: list[object], code: int, complaint: str) -> None:
+    run = in_process("render", tmp_path, "--count", 1, *arguments)
+    assert run.code == code
+    assert run.err.startswith("ERROR:")
+    assert complaint in run.err
+    assert run.err.count("\n") == 1
