@@ -8,15 +8,12 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import threading
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import click
@@ -34,11 +31,9 @@ COMMANDS = {
 """Subcommands in the order of `--help`; each lives in lbmc_cli/NAME.py as a click command of that name."""
 
 EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
-EXIT_INTERRUPTED, EXIT_TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
-
-
-class TerminatedError(BaseException):
-    """SIGTERM arrived. Not an Exception, so that only clean-up code sees it."""
+EXIT_SIGNAL = 128
+"""What shells add to the number of the signal that ended a program."""
+STOPPED_WORDS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 
 
 class LazyGroup(click.Group):
@@ -50,7 +45,6 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        refuse_shadowed_packages()
         name = cmd_name.replace("-", "_")
         command: click.Command = getattr(import_module(f"lbmc_cli.{name}"), name)
         return command
@@ -109,10 +103,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0 done; 1 some frames failed, or an unexpected error; 2 usage or a refused output; 3 an unreadable or unsuitable
     input; 130 and 143 after SIGINT and SIGTERM. Errors are one line on stderr that starts with `ERROR:`.
     """
+    try:
+        refuse_shadowed_packages()
+    except click.ClickException as error:
+        return _report(error.format_message(), error.exit_code)
+    from pipelines.signals import StoppedError, stopped_by_signals
+
     warnings.showwarning = _show_warning
     context: dict[str, Any] = {"debug": False}
     try:
-        with _terminated_by_sigterm():
+        with stopped_by_signals():
             result = lbmc.main(
                 args=None if arguments is None else list(arguments),
                 prog_name="lbmc",
@@ -128,10 +128,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _report(error.format_message() + hint, error.exit_code)
     except click.ClickException as error:
         return _report(error.format_message(), error.exit_code)
-    except (click.Abort, KeyboardInterrupt):
-        return _report("interrupted", EXIT_INTERRUPTED)
-    except TerminatedError:
-        return _report("terminated", EXIT_TERMINATED)
+    except StoppedError as stopped:
+        return _report(STOPPED_WORDS[stopped.number], EXIT_SIGNAL + stopped.number)
     except BrokenPipeError:
         # The reader of our output left (`lbmc info x.exr | head`); Python would complain again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -142,24 +140,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from pipelines.jobs import describe_error
 
         return _report(describe_error(error), getattr(error, "exit_code", EXIT_FAILED))
-
-
-@contextmanager
-def _terminated_by_sigterm() -> Iterator[None]:
-    """While inside, SIGTERM raises TerminatedError in the main thread, so that temporary files are removed."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def terminate(number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        raise TerminatedError
-
-    previous = signal.signal(signal.SIGTERM, terminate)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous)
 
 
 def _report(text: str, code: int) -> int:

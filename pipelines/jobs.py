@@ -12,6 +12,7 @@ from typing import Generic, TypeVar
 
 from deep_io.errors import LbmcError
 from pipelines.progress import Progress
+from pipelines.signals import raise_if_stopped
 
 EXIT_OK = 0
 EXIT_SOME_FAILED = 1
@@ -95,7 +96,7 @@ def run_frames(
 
     `work` may call `progress.update` and `progress.note`; begin and finish happen here. An exception fails its frame
     only: it is told at once through `progress.fail` and kept in the report. FrameSkippedError skips the frame.
-    KeyboardInterrupt and other BaseExceptions end the job.
+    KeyboardInterrupt, StoppedError and other BaseExceptions end the job.
     """
     results: list[FrameResult[Value]] = []
     for frame in frames:
@@ -116,6 +117,7 @@ def run_frames(
         seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
         results.append(FrameResult(name, seconds, cpu_seconds, value, error, skipped))
         progress.finish()
+        raise_if_stopped()
     return JobReport(tuple(results))
 
 

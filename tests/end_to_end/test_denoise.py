@@ -189,7 +189,7 @@ def test_a_signal_leaves_no_file_behind(number: signal.Signals, weights: Path, t
                 break
         process.send_signal(number)
         _, rest = process.communicate(timeout=60)
-    assert process.returncode == 128 + number
+    assert process.returncode == 128 + number, rest
     assert rest.splitlines()[-1].startswith("ERROR: ")
     time.sleep(0.1)
     assert not list(tmp_path.glob(".*"))
