@@ -42,12 +42,14 @@ def train(
 
     A run that finds its own checkpoint in OUT resumes it.
     """
+    from pipelines.allocator import keep_freed_memory
     from pipelines.training import job
     from pipelines.training.recipe import Recipe
 
     recipe = Recipe(
         steps=steps, batch=batch, crop=crop, learning_rate=learning_rate, seed=seed, validate_every=validate_every
     )
+    keep_freed_memory()
     path = job.train(data, validation, out, network, recipe, start, threads, seconds, click.echo)
     click.echo(f"wrote {path}")
     return 0
