@@ -52,7 +52,7 @@ def sky(rng: np.random.Generator, sun_direction: npt.ArrayLike | None = None) ->
     ground = random_color(rng, 0.05, 0.3)
     image = np.where(d[..., 1:2] < 0, ground * horizon.mean(), image)
     if rng.random() < 0.8:
-        # Five texels across are 1.8 degrees at this resolution, so this sun is a little larger and softer than ours.
+        # A texel is a third of a degree, so this sun of 0.7 to 1.7 degrees is larger and softer than ours of 0.5.
         radius = rng.uniform(0.006, 0.015)
         disc = cosine > np.cos(radius)
         if not disc.any():

@@ -70,7 +70,7 @@ def trace(stage: Stage, camera: Camera, samples: int, motions: dict[int, Motion]
     return {name: values.reshape(-1, samples) for name, values in channels.items()}, x, y
 
 
-def pinhole(camera: Camera, point: Array) -> tuple[Array, Array]:
+def pinhole(camera: Camera, point: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], ...]:
     """Pixel positions of world points (..., 3) in the camera's middle pose, in NumPy and from the definition."""
     v = point - camera.origin
     z = v @ camera.forward
