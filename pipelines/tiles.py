@@ -31,14 +31,14 @@ def memory_needed(rows: int, width: int, samples_per_pixel: float) -> int:
 
 def plan_bands(height: int, width: int, samples_per_pixel: float, reach: int, stride: int, memory: int) -> list[Band]:
     """The fewest equal bands that fit the budget; where none fits, bands of one stride, the smallest there are."""
-    for count in range(1, -(-height // stride) + 1):
-        rows = -(-height // count)
-        rows = -(-rows // stride) * stride
-        bands = [_band(y, min(y + rows, height), height, reach, stride) for y in range(0, height, rows)]
-        tallest = max(band.read1 - band.read0 for band in bands)
-        if memory_needed(tallest, width, samples_per_pixel) <= memory:
-            return bands
-    return bands
+    if memory_needed(height, width, samples_per_pixel) <= memory:
+        return [Band(0, height, 0, height)]
+    per_row = memory_needed(1, width, samples_per_pixel) - BYTES_BASE
+    halo = 2 * reach + stride  # above, below, and down to the grid
+    fitting = max((memory - BYTES_BASE) // per_row - halo, stride) // stride * stride
+    rows = -(-height // -(-height // fitting))  # as many bands, but equal ones
+    rows = -(-rows // stride) * stride
+    return [_band(y, min(y + rows, height), height, reach, stride) for y in range(0, height, rows)]
 
 
 def _band(y0: int, y1: int, height: int, reach: int, stride: int) -> Band:

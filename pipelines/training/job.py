@@ -10,14 +10,12 @@ from pathlib import Path
 import torch
 
 from deep_io.errors import UsageError
-from model import config as configs
 from model import zoo
-from model.config import Config
+from model.config import CONFIGS
 from pipelines.training.cache import SampleCache, build_cache
 from pipelines.training.loop import Trainer
 from pipelines.training.recipe import Recipe
 
-CONFIGS: dict[str, Config] = {"fast": configs.FAST}
 FEWEST_SCENES = 2
 
 
@@ -36,6 +34,7 @@ def train(
 
     Parameters
     ----------
+    preset : a name of model.config.CONFIGS
     data, validation : folders of NAME.deep.exr with NAME.ref.exr; decoded caches are kept beside them
     folder : checkpoints, curve and weights; a checkpoint in it is resumed
     start : weight file to start from instead of random weights

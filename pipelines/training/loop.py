@@ -21,7 +21,7 @@ from model.config import Config
 from model.denoiser import Denoiser
 from model.features import FrameScale
 from model.losses import EPSILON, smape, total_loss
-from pipelines.training.batches import Batch, common_roles, crop_samples, random_batch, to_samples
+from pipelines.training.batches import Batch, common_roles, random_batch, to_samples
 from pipelines.training.cache import SampleCache, SceneEntry
 from pipelines.training.recipe import Recipe
 
@@ -183,6 +183,3 @@ class Trainer:
             for mine, theirs in zip(self.averaged.parameters(), self.net.parameters(), strict=True):
                 mine.lerp_(theirs, 1 - keep)
         return float(loss.detach())
-
-
-__all__ = ["Trainer", "Score", "validate", "learning_rate", "crop_samples"]
