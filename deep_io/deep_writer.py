@@ -43,6 +43,7 @@ class DeepWriter:
                 file, each with a name of its own; type, structure and compression are replaced
     compression "none", "rle" or "zips"
     threads     encoding threads; None for one per available core, at most 8. The bytes never depend on it.
+    small       zips: a smaller file for more time, for files that are kept rather than passed on
 
     Rows come in blocks that follow each other: downwards from the top of the data window, or upwards from the bottom
     where the header's line_order is "decreasing". Closing without an error completes the chunk tables; it raises
@@ -51,14 +52,14 @@ class DeepWriter:
     """
 
     def __init__(self, path: PathLike, header: Header | Sequence[Header], compression: str = "zips",
-                 threads: int | None = None) -> None:
+                 threads: int | None = None, small: bool = False) -> None:
         headers = [header] if isinstance(header, Header) else list(header)
         self._multipart = not isinstance(header, Header)
         if compression not in codec.COMPRESSIONS:
             raise ValueError(f"deep files are written with {', '.join(codec.COMPRESSIONS)}, not {compression!r}")
         if self._multipart:
             _check_parts(headers)
-        self._parts = [_Part(header, compression) for header in headers]
+        self._parts = [_Part(header, compression, small) for header in headers]
         self._pool: ThreadPoolExecutor | None = None
         start = self._encode_start()
         self._file = _create(path)
@@ -130,7 +131,7 @@ class DeepWriter:
 class _Part:
     """A part being written: its header, which rows are done and how the next ones are encoded."""
 
-    def __init__(self, header: Header, compression: str) -> None:
+    def __init__(self, header: Header, compression: str, small: bool) -> None:
         if header.line_order not in ("increasing", "decreasing"):
             raise ValueError(f"deep scanlines have no {header.line_order} line order")
         _check_channels(header)
@@ -140,6 +141,7 @@ class _Part:
             "maxSamplesPerPixel": attribute(0)})
         self._channels = sorted(header.channels, key=lambda channel: channel.name.encode("utf-8", "surrogateescape"))
         self._upwards = header.line_order == "decreasing"
+        self._small = small
         self.offsets = np.zeros(height, np.int64)
         self.written = 0
 
@@ -166,7 +168,8 @@ class _Part:
             line = np.concatenate([values[begin * width:end * width]
                                    for values, width in zip(pairs, widths, strict=True)])
             sums = np.cumsum(samples.counts[row], dtype="<i4")
-            return codec.encode(sums.view(np.uint16), compression), codec.encode(line, compression), line.nbytes
+            table = codec.encode(sums.view(np.uint16), compression, self._small)
+            return table, codec.encode(line, compression, self._small), line.nbytes
 
         return encode
 

@@ -27,6 +27,9 @@ MIN_WEIGHT = 2.0**-10  # a layer that is less of the pixel than this joins its n
 # value of more than this times the pixel's sum |C| would show that beyond 1e-5 of the sum.
 FLOAT_GAIN = 16.0
 
+# Depth is rounded to this many significant bits: finer than a filtered depth is known, and a third of its bytes.
+DEPTH_BITS = 16
+
 COLOR, ALPHA, WEIGHT, DEPTH = slice(0, 3), 3, 4, 5  # the planes of a stack
 SUMS = slice(0, 5)  # those that add up when layers are pooled
 
@@ -56,7 +59,8 @@ def encode_layers(color: Planes, weight: Planes, coverage: Planes, depth: Planes
         color     (L, 3, P) C_l, what each layer adds to the beauty; finite, may be negative
         weight    (L, P) V_l, its share of the pixel; >= 0, sums to 1, or to 0 in a pixel that nothing reached
         coverage  (L, P) A_l, what it adds to the beauty's alpha; 0 <= A_l <= V_l
-        depth     (L, P) not finite where a layer has no hit; None where depth is not known at all
+        depth     (L, P) not finite where a layer has no hit; None where depth is not known at all. Rounded to
+                  DEPTH_BITS, within 1 part in 65536
         dtype     float16 or float32, of the result's color and alpha
         by_depth  True: front to back by depth, layers of equal depth pooled, for deep samples, whose place in the
                   pixel need not be their layer's. False: in the layers' own order, for one picture per layer
@@ -69,7 +73,7 @@ def encode_layers(color: Planes, weight: Planes, coverage: Planes, depth: Planes
     planes[:, COLOR], planes[:, ALPHA], planes[:, WEIGHT] = color, coverage, weight
     planes[:, DEPTH] = MISS_DEPTH
     if depth is not None:
-        np.copyto(planes[:, DEPTH], depth, where=np.isfinite(depth))
+        np.copyto(planes[:, DEPTH], _rounded(depth), where=np.isfinite(depth))
     slot = np.repeat(np.arange(layers, dtype=np.int8)[:, None], pixels, axis=1)
     if by_depth:
         _sort_by_depth(planes, slot)
@@ -89,6 +93,14 @@ def deep_samples(layers: OverLayers, window: Window) -> DeepSamples:
     channels |= {"A": samples(layers.alpha), "Z": samples(layers.depth)}
     counts = layers.present.sum(axis=0, dtype=np.int32).reshape(window.height, window.width)
     return DeepSamples(counts, channels, window)
+
+
+def _rounded(depth: Planes) -> Planes:
+    """Depth to DEPTH_BITS significant bits; what that would make infinite stays."""
+    drop = np.uint32(24 - DEPTH_BITS)
+    bits = (np.ascontiguousarray(depth, np.float32).view(np.uint32) + (np.uint32(1) << (drop - np.uint32(1))))
+    rounded = ((bits >> drop) << drop).view(np.float32)
+    return np.where(np.isfinite(rounded), rounded, depth)
 
 
 def _sort_by_depth(planes: Planes, slot: NDArray[np.int8]) -> None:

@@ -105,7 +105,7 @@ class ExportJob(Job):
                       attributes=attributes)
         clamped, window = 0, header.data_window
         with atomic_output(target) as temporary, DeepWriter(temporary, deep, self.options.compression,
-                                                            self.options.threads) as writer:
+                                                            self.options.threads, small=True) as writer:
             for rows in _row_blocks(*layers.weight.shape[1:]):
                 block = encode_rows(layers, rows, self._dtype, by_depth=True)
                 writer.write(deep_samples(block, window.rows(window.ymin + rows.start, window.ymin + rows.stop)))

@@ -113,3 +113,10 @@ def test_deflate_packs_no_tighter_than_the_ratio_assumed():
     zeros = bytes(10_000_000)
     for packed in (zlib.compress(zeros, 9), deflate.zlib_compress(zeros, 12)):
         assert len(zeros) <= codec.MAX_RATIO["zips"] * len(packed)
+
+
+def test_small_zips_are_zips_and_smaller() -> None:
+    line = smooth(6000)
+    small = codec.encode(line, "zips", small=True)
+    assert len(small) < len(codec.encode(line, "zips"))
+    assert zlib.decompress(small) == plain_transform(line.tobytes())

@@ -222,3 +222,13 @@ def test_what_half_cannot_hold_at_all_is_clamped_and_counted() -> None:
     encoded = encode_layers(*one_pixel((1.0, 1, 1.0, (1e6, -1e6, 1))), np.float16, True)
     assert encoded.color[0, :, 0].tolist() == [HALF_MAX, -HALF_MAX, 1]
     assert encoded.clamped == 2
+
+
+@seeded
+@given(st.lists(st.floats(2.0**-100, 2.0**126, width=32), min_size=1, max_size=20))
+def test_depth_is_rounded_to_sixteen_bits(depths: list[float]) -> None:
+    frame: list[list[Layer]] = [[(1.0, 1.0, depth, (1, 1, 1))] for depth in depths]
+    encoded = encode_layers(*arrays(frame), np.float16, True)
+    wanted = np.array(depths, np.float32)
+    assert (np.abs(encoded.depth[0] - wanted) <= wanted * 2.0**-16).all()
+    assert not (encoded.depth.view(np.uint32) & 0xFF).any()
