@@ -48,6 +48,9 @@ class PathSamples:
                                     so a depth of 0 is an unknown one
     window    Window                the pixels' place in the frame
     repairs   Counter               role -> samples whose value was not finite (or a depth negative) and mended
+    extra     float32 (N, E)        the channels carried along, those that are parts of the radiance first
+    source    int64 (N,)            which sample of the file's block each one is, -1 for a virtual miss; None: all, in
+                                    their order
     """
 
     counts: NDArray[np.int32]
@@ -56,6 +59,8 @@ class PathSamples:
     roles: dict[str, Values]
     window: Window
     repairs: Counter[str] = field(default_factory=Counter)
+    extra: Values = field(default_factory=lambda: np.empty((0, 0), np.float32))
+    source: Index | None = None
 
     @property
     def total(self) -> int:
@@ -73,6 +78,8 @@ class Interpretation:
     """Everything that turns a file's channels into path samples; one per file, the same for all its blocks.
 
     declared  whether the weighting was given by the header or an option; if not, fractional alpha is refused
+    lights    channels to carry along that are parts of the radiance, weighted and stored as it is
+    data      channels to carry along that are anything else
     """
 
     header: Header
@@ -81,6 +88,8 @@ class Interpretation:
     declared: bool
     conventions: Conventions
     path: str
+    lights: tuple[str, ...] = ()
+    data: tuple[str, ...] = ()
 
 
 def interpretation(header: Header, path: str, overrides: Mapping[str, str] | None = None,
@@ -112,18 +121,22 @@ def decode_block(counts: NDArray[np.int32], channels: dict[str, NDArray[np.gener
                  how: Interpretation) -> PathSamples:
     """Path samples of a block; takes the channels out of `channels` role by role, so that nothing is held twice."""
     repairs: Counter[str] = Counter()
+    lights, data = (_carried(names, channels, repairs) for names in (how.lights, how.data))
     radiance, broken = _radiance(how.mapping, channels, how.weighting, repairs)
     depth, alpha = _depth(how, channels), _alpha(how.mapping, channels, repairs)
     if alpha is not None and not how.declared and has_fractions(alpha):
         raise InputError(f"{how.path}: alpha is fractional and the header has no {ATTRIBUTE}, so the samples may be "
                          f"path samples or ordinary deep; pass --weighting uniform or over")
+    if how.lights:
+        radiance = np.concatenate([radiance, lights], axis=1)
     decoded = _weighted(how.weighting, counts, radiance, alpha, depth)
     del radiance
     if broken is not None:
         _leave_out(decoded, broken)
     _cover_by_depth(decoded, depth, how.conventions)
     misses = np.flatnonzero(decoded.coverage == 0)
-    roles = {"radiance": decoded.radiance}
+    extra = _extra(decoded, data)
+    roles = {"radiance": decoded.radiance[:, :3]}
     for role in how.mapping.sources:
         if role in ("radiance", "coverage"):
             continue
@@ -135,7 +148,32 @@ def decode_block(counts: NDArray[np.int32], channels: dict[str, NDArray[np.gener
     factor = how.conventions.planar_factor(how.header, window) if "depth" in roles else None
     if factor is not None:
         roles["depth"] *= np.repeat(factor.ravel(), decoded.counts)[:, None]
-    return PathSamples(decoded.counts.reshape(counts.shape), decoded.weight, decoded.coverage, roles, window, repairs)
+    return PathSamples(decoded.counts.reshape(counts.shape), decoded.weight, decoded.coverage, roles, window, repairs,
+                       extra, decoded.order)
+
+
+def _carried(names: tuple[str, ...], channels: Mapping[str, NDArray[np.generic]], repairs: Counter[str]) -> Values:
+    """(N, len(names)) float32 of channels, finite: an overflow of half is its largest value, the rest becomes 0."""
+    columns = []
+    for name in names:
+        values = channels[name].astype(np.float32)
+        if not _all_finite(values):
+            repairs[name] += int((~np.isfinite(values)).sum())
+            values[np.isposinf(values) & (channels[name].dtype == np.float16)] = _LARGEST_HALF
+            values[~np.isfinite(values)] = 0
+        columns.append(values)
+    return np.stack(columns, axis=1) if columns else np.empty((0, 0), np.float32)
+
+
+def _extra(decoded: Weighted, data: Values) -> Values:
+    """(M, E) the carried channels of the decoded samples: lights, decoded with the radiance, then data."""
+    lights = decoded.radiance[:, 3:]
+    if not data.shape[1]:
+        return lights
+    ordered = _in_order(data, decoded)
+    if decoded.order is not None:
+        ordered = np.where(decoded.order[:, None] < 0, np.float32(0), ordered)
+    return np.concatenate([lights, ordered], axis=1)
 
 
 def _weighted(weighting: str, counts: NDArray[np.int32], radiance: Values, alpha: NDArray[np.floating[Any]] | None,

@@ -20,7 +20,7 @@ _SMALLEST = float(np.finfo(np.float32).tiny)  # a weight below is none: float32 
 def decode_over(counts: Counts, radiance: Floats, alpha: Floats, depth: Floats | None) -> Weighted:
     """Ordinary deep samples as weighted ones that have the same flattened colour and alpha.
 
-    radiance (N, 3), alpha (N,), depth (N,) or None for samples stored front to back.
+    radiance (N, 3 or more), alpha (N,), depth (N,) or None for samples stored front to back.
 
     Samples of equal depth act as one of joint alpha 1 - prod(1 - a_j), shared in proportion to -log1p(-a_j); opaque
     ones among them share it alone. A sample without weight (emissive, or hidden) hands its contribution to the next
@@ -116,7 +116,7 @@ def _hand_on(counts: Counts, order: Index, pixel: Index, holds: NDArray[np.bool_
     is_miss[ends[has_miss] - 1] = True
 
     source = np.full(is_miss.size, -1, np.int64)
-    weights, colour = np.zeros(is_miss.size), np.zeros((is_miss.size, 3))
+    weights, colour = np.zeros(is_miss.size), np.zeros((is_miss.size, contribution.shape[1]))
     source[~is_miss], weights[~is_miss], colour[~is_miss] = order[holds], weight[holds], contribution[holds]
     weights[is_miss] = left[has_miss]
 
@@ -126,7 +126,7 @@ def _hand_on(counts: Counts, order: Index, pixel: Index, holds: NDArray[np.bool_
     holders_before = np.cumsum(holds)[giving] - (np.cumsum(kept_counts) - kept_counts)[pixel[giving]]
     first = (ends - new_counts)[pixel[giving]]
     receiver = first + np.minimum(holders_before, new_counts[pixel[giving]] - 1)
-    for channel in range(3):
+    for channel in range(contribution.shape[1]):
         colour[:, channel] += np.bincount(receiver, contribution[giving, channel], is_miss.size)
     value = colour / weights[:, None]
     return Weighted(new_counts, source, weights.astype(np.float32), (~is_miss).astype(np.float32),

@@ -5,7 +5,8 @@ The last stop of deep_io on the way in. What the channels mean is decoding.py, b
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
@@ -109,12 +110,38 @@ class SampleReader:
         """Stored samples in the file."""
         return self._reader.total
 
+    def carry(self, lights: Iterable[str] = (), data: Iterable[str] = ()) -> None:
+        """Channels to read into PathSamples.extra from now on: parts of the radiance, then anything else.
+
+        Raises KeyError for a channel that does not exist.
+        """
+        lights, data = tuple(lights), tuple(data)
+        types = {channel.name: channel.dtype for channel in self.header.channels}
+        for name in (*lights, *data):
+            types[name]
+        self._interpretation = replace(self._interpretation, lights=lights, data=data)
+
+    @property
+    def carried(self) -> int:
+        """How many channels are carried along."""
+        return len(self._interpretation.lights) + len(self._interpretation.data)
+
+    @property
+    def carried_lights(self) -> int:
+        """How many of them, the first ones, are parts of the radiance."""
+        return len(self._interpretation.lights)
+
+    @property
+    def _channels(self) -> tuple[str, ...]:
+        how = self._interpretation
+        return tuple(dict.fromkeys((*self.mapping.channels, *how.lights, *how.data)))
+
     def read(self, y0: int | None = None, y1: int | None = None) -> PathSamples:
         """Rows y0 to y1 exclusive in absolute pixel coordinates (default: all).
 
         Raises ValueError for rows outside the data window, InputError for corrupt or unsuitable samples.
         """
-        return self._decode(self._reader.read(y0, y1, self.mapping.channels))
+        return self._decode(self._reader.read(y0, y1, self._channels))
 
     def blocks(self, max_bytes: int = DEFAULT_BLOCK_BYTES) -> Iterator[PathSamples]:
         """The frame in blocks of whole rows from the top.
@@ -122,9 +149,9 @@ class SampleReader:
         `max_bytes` bounds the stored samples of a block, MAX_BLOCK_SAMPLES their number (a larger row stands alone).
         """
         types = {channel.name: channel.dtype.itemsize for channel in self.header.channels}
-        sample_bytes = sum(types[name] for name in self.mapping.channels)
+        sample_bytes = sum(types[name] for name in self._channels)
         max_bytes = min(max_bytes, MAX_BLOCK_SAMPLES * sample_bytes)
-        for block in self._reader.blocks(max_bytes, self.mapping.channels):
+        for block in self._reader.blocks(max_bytes, self._channels):
             yield self._decode(block)
 
     def _decode(self, deep: DeepSamples) -> PathSamples:

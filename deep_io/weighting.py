@@ -37,7 +37,7 @@ class Weighted:
     order     int64 (M,)       which stored sample each decoded one is, -1 for a virtual miss; None: all, in place
     weight    float32 (M,)     sums to 1 in every pixel that has samples
     coverage  float32 (M,)     alpha of each sample, 0..1
-    radiance  float32 (M, 3)   linear radiance of each sample
+    radiance  float32 (M, 3)   linear radiance of each sample, and what was decoded with it in further columns
     """
 
     counts: Counts
@@ -66,7 +66,7 @@ def has_fractions(alpha: Floats) -> bool:
 
 
 def decode_uniform(counts: Counts, radiance: Floats, alpha: Floats | None) -> Weighted:
-    """Samples as stored, each of weight 1/n. radiance (N, 3); alpha (N,), or None for 1 everywhere."""
+    """Samples as stored, each of weight 1/n. radiance (N, 3 or more); alpha (N,), or None for 1 everywhere."""
     colour = np.asarray(radiance, np.float32)
     coverage = np.ones(len(colour), np.float32) if alpha is None else np.asarray(alpha, np.float32)
     return Weighted(counts.ravel(), None, uniform_weights(counts), coverage, colour)

@@ -22,12 +22,14 @@ class Layers:
     weight : (B, L, H, W) V_l >= 0, sums to 1 over layers wherever any sample reaches
     coverage : (B, L, H, W) A_l, 0 <= A_l <= V_l
     depth : (B, L, H, W) Z_l, mean depth of the layer's hits in scene units, inf where it has none; 1 without that role
+    extra : (B, L, E, H, W) what each layer adds to the extra values of the samples; E is 0 without any
     """
 
     color: Tensor
     weight: Tensor
     coverage: Tensor
     depth: Tensor
+    extra: Tensor
 
     def beauty(self) -> Tensor:
         """(B, 3, H, W) denoised radiance."""
@@ -49,13 +51,14 @@ def composite(means: Tensor, joint_mass: Tensor | None = None) -> Tensor:
 
     Parameters
     ----------
-    means : (B, L, 6, H, W) per unit of the filtered occupancy: radiance (3), coverage, coverage * depth, share w / n
+    means : (B, L, 6 + E, H, W) per unit of the filtered occupancy: radiance (3), coverage, coverage * depth, share
+        w / n, extra values
     joint_mass : (B, L, H, W) log of the filtered own weight. If given, the layers are averaged by it instead of being
         composited front to back (LAYER_w), and `means` are per unit of that weight.
 
     Returns
     -------
-    (B, L, 6, H, W) visible planes, additive over layers: C (3), A, A * Z, V; 0 where no sample is in reach.
+    (B, L, 6 + E, H, W) visible planes, additive over layers: C (3), A, A * Z, V, extra; 0 where no sample is in reach.
     """
     alpha = means[:, :, 5].clamp(0, 1)
     if joint_mass is None:
@@ -66,7 +69,8 @@ def composite(means: Tensor, joint_mass: Tensor | None = None) -> Tensor:
         visible = weight = torch.softmax(torch.where(reached, joint_mass, 0), 1) * reached
     planes = means[:, :, :5] * visible[:, :, None]
     color, coverage, depth = torch.split(planes, [3, 1, 1], 2)
-    return torch.cat([color, torch.minimum(coverage, weight[:, :, None]), depth, weight[:, :, None]], 2)
+    extra = means[:, :, 6:] * visible[:, :, None]
+    return torch.cat([color, torch.minimum(coverage, weight[:, :, None]), depth, weight[:, :, None], extra], 2)
 
 
 def mix_levels(finished: Sequence[Tensor], preference: Tensor) -> Tensor:
@@ -97,10 +101,11 @@ def mix_levels(finished: Sequence[Tensor], preference: Tensor) -> Tensor:
 
 
 def to_layers(visible: Tensor) -> Layers:
-    """Visible planes (B, L, 6, H, W), see `composite` -> `Layers`."""
+    """Visible planes (B, L, 6 + E, H, W), see `composite` -> `Layers`."""
     color, coverage, depth, weight = visible[:, :, :3], visible[:, :, 3], visible[:, :, 4], visible[:, :, 5]
     some = coverage > 0
-    return Layers(color, weight, coverage, torch.where(some, depth / torch.where(some, coverage, 1), torch.inf))
+    return Layers(color, weight, coverage, torch.where(some, depth / torch.where(some, coverage, 1), torch.inf),
+                  visible[:, :, 6:])
 
 
 def fill_holes(layers: Layers) -> Layers:
@@ -114,7 +119,8 @@ def fill_holes(layers: Layers) -> Layers:
         return layers
     count, _, height, width = layers.color.shape[1:]
     depth = torch.where(layers.depth.isfinite(), layers.depth, 0) * layers.coverage
-    stack = torch.cat([layers.color.flatten(1, 2), layers.weight, layers.coverage, depth, reached.to(depth.dtype)], 1)
+    stack = torch.cat([layers.color.flatten(1, 2), layers.weight, layers.coverage, depth, layers.extra.flatten(1, 2),
+                       reached.to(depth.dtype)], 1)
     filled, known, size = stack, reached, 1
     while not bool(known.all()) and size < max(height, width):
         size *= 2
@@ -124,6 +130,8 @@ def fill_holes(layers: Layers) -> Layers:
         found = ~known & (up[:, -1:] > 0)
         filled = torch.where(found, up / torch.where(up[:, -1:] > 0, up[:, -1:], 1), filled)
         known = known | found
-    color, *rest = torch.split(filled, [3 * count, count, count, count, 1], 1)
-    weight, coverage, depth = (plane[:, :, None] for plane in rest[:3])
-    return to_layers(torch.cat([torch.unflatten(color, 1, (count, 3)), coverage, depth, weight], 2))
+    sizes = [3 * count, count, count, count, count * layers.extra.shape[2], 1]
+    color, weight, coverage, depth, extra, _ = torch.split(filled, sizes, 1)
+    basic = [plane[:, :, None] for plane in (coverage, depth, weight)]
+    return to_layers(torch.cat([torch.unflatten(color, 1, (count, 3)), *basic,
+                                torch.unflatten(extra, 1, (count, layers.extra.shape[2]))], 2))

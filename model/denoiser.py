@@ -16,9 +16,25 @@ from model.compositing import Layers, composite, fill_holes, to_layers
 from model.config import Config
 from model.direct import filter_direct, make_generators, splat_samples
 from model.features import FrameScale, log_radiance
-from model.guided import GUIDED_COLUMNS, filter_guided, generator_sizes, guide_values, initial_guides, predict
+from model.guided import (
+    GUIDED_COLUMNS,
+    demodulated_lights,
+    filter_guided,
+    generator_sizes,
+    guide_values,
+    initial_guides,
+    predict,
+)
 from model.networks import Mlp, Products, UNet
-from model.partition import PRIOR_WINDOW, basic_values, initial_logits, kept_logits, relative_depth, splat
+from model.partition import (
+    PRIOR_WINDOW,
+    basic_values,
+    extra_values,
+    initial_logits,
+    kept_logits,
+    relative_depth,
+    splat,
+)
 from model.reach import influence
 from model.reducer import LogFeatures, SampleReducer, context_inputs, pixel_rows
 from model.samples import Samples, Segments
@@ -121,6 +137,22 @@ class Denoiser(nn.Module):
         result = to_layers(visible)
         return fill_holes(result) if fill else result
 
+    def partition(self, samples: Samples, scale: FrameScale, layers: int | None = None) -> Tensor:
+        """(N, L): how each sample is shared among the layers, front first; rows sum to 1. As in `forward`."""
+        keep = kept_logits(layers or self.config.layers, self.config.partition_logits)
+        if not self.config.layered:
+            return torch.ones_like(samples.weight[:, None])
+        relative = None
+        if self.config.depth_prior and "depth" in samples.roles:
+            relative = relative_depth(samples, Segments(samples.counts), scale)
+        contexts, _ = self._context(samples, relative, scale)
+        context = _rows(contexts[0], samples.shape)
+        shares = []
+        for part, rows, part_relative in _chunks(samples, relative):
+            embedding = self.reducer(part, scale)
+            shares.append(self._partition(part, embedding, part_relative, context[rows], scale, keep)[0].exp())
+        return torch.cat(shares, 0)
+
     # --- context ---------------------------------------------------------------------------------------------------
 
     def _context(self, samples: Samples, relative: Tensor | None, scale: FrameScale) -> tuple[list[Tensor], Tensor]:
@@ -147,7 +179,7 @@ class Denoiser(nn.Module):
 
     def _splat(self, samples: Samples, embedding: Tensor, relative: Tensor | None, context: Tensor, scale: FrameScale,
                keep: list[int]) -> Tensor:
-        """(P, L, K) rows: log n, log w, then per unit of occupancy basic values, guides if needed, embedding."""
+        """(P, L, K) rows: log n, log w, then per unit of occupancy basic values, guides if needed, embedding, extra."""
         segments = Segments(samples.counts)
         log_weight = torch.log(samples.weight[:, None])
         log_partition = torch.zeros_like(log_weight)
@@ -157,7 +189,9 @@ class Denoiser(nn.Module):
         values = [basic_values(samples, scale)]
         if self.config.kernel == "affinity":
             values.append(guide_values(samples, scale))
-        values.append(embedding.to(values[0].dtype))
+        values += [embedding.to(values[0].dtype), *extra_values(samples)]
+        if self.config.demodulation:
+            values += demodulated_lights(samples)
         result = splat(log_weight, log_partition, torch.cat(values, 1), segments)
         return torch.cat([result.log_n[..., None], result.log_w[..., None], result.values], 2)
 
@@ -184,28 +218,31 @@ class Denoiser(nn.Module):
 
     def _filter_affinity(self, samples: Samples, embedding: Tensor, relative: Tensor | None, context: Tensor,
                          scale: FrameScale, keep: list[int]) -> Tensor:
-        """(B, L, 6, H, W) visible planes."""
+        """(B, L, 6 + E, H, W) visible planes."""
         planes, predictions = [], []
         for rows, part in self._splat_chunks(samples, embedding, relative, context, scale, keep):
-            predictions.append(predict(self.generator, self.layer_bias[keep], part, context[rows]))
-            planes.append(part[..., :GUIDED_COLUMNS].contiguous())  # the embedding has done its work
+            end = GUIDED_COLUMNS + self.config.embedding
+            predictions.append(predict(self.generator, self.layer_bias[keep], part[..., :end], context[rows]))
+            # the embedding has done its work
+            planes.append(torch.cat([part[..., :GUIDED_COLUMNS], part[..., end:]], -1))
         splats, predicted = (_picture(parts, samples.shape).flatten(0, 1) for parts in (planes, predictions))
-        means = filter_guided(splats, predicted, self.guide_matrix, self.config)
+        means = filter_guided(splats, predicted, self.guide_matrix, self.config, samples.lights)
         return composite(means.view(samples.shape[0], len(keep), *means.shape[1:]))
 
     def _filter_direct(self, samples: Samples, embedding: Tensor, relative: Tensor | None, contexts: list[Tensor],
                        context: Tensor, scale: FrameScale, keep: list[int]) -> Tensor:
-        """(B, L, 6, H, W) visible planes."""
+        """(B, L, 6 + E, H, W) visible planes."""
         planes = [part for _, part in self._splat_chunks(samples, embedding, relative, context, scale, keep)]
         return filter_direct(_picture(planes, samples.shape), contexts, self.generators, self.config)
 
     def _splat_samples(self, samples: Samples, embedding: Tensor, context: Tensor, scale: FrameScale) -> Tensor:
-        """(B, 1, 6, H, W) visible planes."""
+        """(B, 1, 6 + E, H, W) visible planes."""
         if len(embedding) < len(samples.weight):
             embedding = torch.cat([self.reducer(part, scale) for part, _, _ in _chunks(samples, None)], 0)
         generator = self.generators[0]
         assert isinstance(generator, Mlp)
-        return splat_samples(samples, basic_values(samples, scale), embedding, context, generator)
+        values = torch.cat([basic_values(samples, scale), *extra_values(samples)], 1)
+        return splat_samples(samples, values, embedding, context, generator)
 
 
 def _chunks(samples: Samples, relative: Tensor | None) -> Iterator[tuple[Samples, slice, Tensor | None]]:
@@ -221,13 +258,7 @@ def _chunks(samples: Samples, relative: Tensor | None) -> Iterator[tuple[Samples
         last = int(torch.searchsorted(ends, start + CHUNK_SAMPLES, right=True))
         last = min(max(last, first + 1), pixels)
         stop = int(ends[last - 1])
-        part = Samples(
-            (1, 1, last - first),
-            samples.counts[first:last],
-            samples.weight[start:stop],
-            samples.coverage[start:stop],
-            {role: values[start:stop] for role, values in samples.roles.items()},
-        )
+        part = samples.pixel_range(first, last, start, stop)
         yield part, slice(first, last), None if relative is None else relative[start:stop]
         first, start = last, stop
 

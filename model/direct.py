@@ -36,9 +36,9 @@ def make_generators(config: Config, contexts: Sequence[int]) -> nn.ModuleList:
 def filter_direct(planes: Tensor, contexts: Sequence[Tensor], generators: nn.ModuleList, config: Config) -> Tensor:
     """Filters and composites every level, and mixes the levels.
 
-    planes (B, L, K, H, W): columns log n, log w, those of `basic_values` per unit of occupancy, embedding.
+    planes (B, L, K, H, W): columns log n, log w, per unit of occupancy those of `basic_values`, embedding, extra.
     contexts (B, C, H / 2**i, W / 2**i), H and W rounded up to the network's stride.
-    Returns (B, L, 6, H, W) visible planes, see `compositing.composite`.
+    Returns (B, L, 6 + E, H, W) visible planes, see `compositing.composite`.
     """
     height, width = planes.shape[-2:]
     coarsest = 2 ** (len(generators) - 1)
@@ -59,16 +59,18 @@ def filter_direct(planes: Tensor, contexts: Sequence[Tensor], generators: nn.Mod
     for number, generator in enumerate(generators):
         assert isinstance(generator, Mlp)
         occupancy, cells = pool_cells(log_n, values, 2**number)
-        basic, embedding, share = torch.split(cells, [BASIC_COLUMNS - 2, config.embedding, 1], 1)
+        fixed = BASIC_COLUMNS - 2 + config.embedding + 1
+        basic, embedding, extra, share = torch.split(
+            cells, [BASIC_COLUMNS - 2, config.embedding, cells.shape[1] - fixed, 1], 1)
         embedding = embedding * torch.exp(occupancy)[:, None]  # E_l, a sum over the samples, as published
         context = contexts[number][..., : occupancy.shape[-2], : occupancy.shape[-1]]
-        means, mass, extra = _filter_level(
+        means, mass, beyond = _filter_level(
             generator, context, by_layer(embedding), occupancy,
-            torch.cat([basic, share], 1), config.kernel_sizes[number], config.variant == "pixel_gather",
+            torch.cat([basic, share, extra], 1), config.kernel_sizes[number], config.variant == "pixel_gather",
         )
         finished.append(composite(by_layer(means), by_layer(mass) if config.variant == "layer_w" else None))
         if number == 0:
-            preference = by_layer(extra)[:, 0]  # (B, levels, H, W) of the first layer
+            preference = by_layer(beyond)[:, 0]  # (B, levels, H, W) of the first layer
     assert preference is not None
     return mix_levels(finished, preference)[..., :height, :width]
 
@@ -108,9 +110,9 @@ def _generate(generator: Mlp, context: Tensor, embedding: Tensor) -> Tensor:
 
 
 def splat_samples(samples: Samples, values: Tensor, embedding: Tensor, context: Tensor, generator: Mlp) -> Tensor:
-    """One splat kernel per sample: values (N, 5) of `basic_values`, embedding (N, E), context (P, C).
+    """One splat kernel per sample: values (N, 5 or more) of `basic_values`, extra; embedding (N, E), context (P, C).
 
-    The samples of a pixel are summed tap by tap before they are spread. Returns (B, 1, 6, H, W) visible planes.
+    The samples of a pixel are summed tap by tap before they are spread. Returns (B, 1, 6 or more, H, W) visible planes.
     """
     batch, height, width = samples.shape
     means = values.new_zeros(batch, values.shape[1], height, width)
@@ -139,7 +141,8 @@ def splat_samples(samples: Samples, values: Tensor, embedding: Tensor, context: 
     if results:
         means, mass = torch.cat([part for part, _ in results]), torch.cat([log for _, log in results])
     share = (mass > -torch.inf).to(means.dtype)[:, None]
-    return composite(torch.cat([means, share], 1)[:, None])
+    basic = BASIC_COLUMNS - 2
+    return composite(torch.cat([means[:, :basic], share, means[:, basic:]], 1)[:, None])
 
 
 def row_blocks(samples: Samples, image: int, budget: int | None) -> Iterator[tuple[int, int, Tensor, slice]]:

@@ -36,6 +36,14 @@ def guide_values(samples: Samples, scale: FrameScale) -> Tensor:
     return torch.cat([radiance / by, normal, log_depth(depth, scale.depth), by], 1)
 
 
+def demodulated_lights(samples: Samples) -> list[Tensor]:
+    """[(N, lights)] the lights among `samples.extra`, demodulated as radiance is, or nothing."""
+    if samples.extra is None or not samples.lights:
+        return []
+    lights = samples.extra[:, : samples.lights]
+    return [lights / divisor(samples).repeat(1, samples.lights // 3)]
+
+
 def generator_sizes(config: Config) -> tuple[int, ...]:
     """What the generator predicts per layer: features, bias and preference per level, guide gate;
     with demodulation also the mix, the divisor's gate and the divisor's bias."""
@@ -57,7 +65,7 @@ def predict(generator: Mlp, layer_bias: Tensor, planes: Tensor, context: Tensor)
 
     The generator sees the layer's mean embedding, its share w / n and its occupancy n.
     """
-    log_n, log_w, values = planes[..., :1], planes[..., 1:2], planes[..., GUIDED_COLUMNS:]
+    log_n, log_w, values = planes[..., :1], planes[..., 1:2], planes[..., GUIDED_COLUMNS:]  # embedding
     share = share_of(log_n, log_w)
     embedding = values / torch.where(share > 0, share, 1)
     weight = torch.exp(log_n)  # below 1 where confidence is low or layers in front took the weight
@@ -66,11 +74,13 @@ def predict(generator: Mlp, layer_bias: Tensor, planes: Tensor, context: Tensor)
     return generator.rest(shared + mine + layer_bias).to(planes.dtype)
 
 
-def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Parameter, config: Config) -> Tensor:
+def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Parameter, config: Config, lights: int
+                  ) -> Tensor:
     """Filters each layer by affinity, radiance along two paths if `config.demodulation`.
 
-    planes (B*L, K, H, W), predictions (B*L, sum(generator_sizes), H, W) -> (B*L, 6, H, W) per unit of filtered
-    occupancy: radiance, coverage, coverage * depth, share; 0 where no source is in reach.
+    planes (B*L, K, H, W): GUIDED_COLUMNS, extra values and, with demodulation, the first `lights` of them demodulated;
+    predictions (B*L, sum(generator_sizes), H, W) -> (B*L, 6 + E, H, W) per unit of filtered occupancy: radiance,
+    coverage, coverage * depth, share, extra values; 0 where no source is in reach.
     """
     log_n, log_w = planes[:, 0], planes[:, 1]
     share = share_of(log_n, log_w)[:, None]
@@ -78,15 +88,21 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
     features, bias, preference, gate, *divided = torch.split(predictions, list(generator_sizes(config)), 1)
     guides = planes[:, GUIDES] / own
     features = features + torch.einsum("bghw,fg->bfhw", guides, guide_matrix) * (2 * torch.sigmoid(gate))
-    values = torch.cat([planes[:, FILTERED], share, *([planes[:, REDUCED]] if config.demodulation else [])], 1)
+    reduced_too = [planes[:, REDUCED]] if config.demodulation else []
+    values = torch.cat([planes[:, FILTERED], share, *reduced_too, planes[:, GUIDED_COLUMNS:]], 1)
     out = affinity_filter(features, bias, preference, log_n, values, config.kernel_sizes)
     if not config.demodulation:
         return out
-    plain, others, reduced = torch.split(out, [3, 3, 3], 1)
+    plain, others, reduced, extra = torch.split(out, [3, 3, 3, out.shape[1] - 9], 1)
     mix, divisor_gate, divisor_bias = divided
     by = guides[:, 4:]
     sharp = by * (DIVISOR_GUIDE_SCALE * torch.sigmoid(divisor_gate))
     factor = affinity_filter(sharp, divisor_bias, torch.zeros_like(divisor_bias), log_w, by, (DIVISOR_WINDOW,))
     # no own weight near the target: nothing to multiply by, the plain path stands
     amount = torch.sigmoid(mix) * (factor.amax(1, keepdim=True) > 0)
-    return torch.cat([torch.lerp(plain, reduced * factor, amount), others], 1)
+    color = torch.lerp(plain, reduced * factor, amount)
+    if not extra.shape[1]:
+        return torch.cat([color, others], 1)
+    light, data, reduced = torch.split(extra, [lights, extra.shape[1] - 2 * lights, lights], 1)
+    light = torch.lerp(light, reduced * factor.repeat(1, lights // 3, 1, 1), amount)
+    return torch.cat([color, others, light, data], 1)

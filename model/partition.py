@@ -88,6 +88,11 @@ def basic_values(samples: Samples, scale: FrameScale) -> Tensor:
     return torch.cat([samples.roles["radiance"], coverage, coverage * hit_depth(samples, scale)[1]], 1)
 
 
+def extra_values(samples: Samples) -> list[Tensor]:
+    """[(N, E)] what the caller wants filtered besides, or nothing."""
+    return [] if samples.extra is None else [samples.extra]
+
+
 def share_of(log_n: Tensor, log_w: Tensor) -> Tensor:
     """w / n in 0..1, 0 where nothing is."""
     return torch.exp(log_w - torch.where(log_n == -torch.inf, 0, log_n))

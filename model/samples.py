@@ -95,6 +95,8 @@ class Samples:
     weight : (N,) >= 0, sums to 1 over each pixel that has samples
     coverage : (N,) 0..1; features of a sample with coverage 0 (a miss) are never read
     roles : role -> (N, width) float32, see ROLE_WIDTHS; "radiance" always, linear, any scale
+    extra : (N, E) values to filter by the radiance's own partition and kernels; never features. None: there are none
+    lights : how many of its first columns are parts of the radiance, filtered along the demodulated path too
     """
 
     shape: tuple[int, int, int]
@@ -102,6 +104,8 @@ class Samples:
     weight: Tensor
     coverage: Tensor
     roles: dict[str, Tensor]
+    extra: Tensor | None = None
+    lights: int = 0
 
     def __post_init__(self) -> None:
         batch, height, width = self.shape
@@ -115,15 +119,19 @@ class Samples:
             if values.shape != (self.weight.numel(), ROLE_WIDTHS[role]):
                 raise ValueError(f"role {role}: shape {tuple(values.shape)}, expected ({self.weight.numel()}, "
                                  f"{ROLE_WIDTHS[role]})")
+        if self.extra is not None and (self.extra.dim() != 2 or len(self.extra) != self.weight.numel()):
+            raise ValueError(f"extra: shape {tuple(self.extra.shape)}, expected ({self.weight.numel()}, any)")
+        if self.lights % 3 or self.lights > (0 if self.extra is None else self.extra.shape[1]):
+            raise ValueError(f"{self.lights} columns of lights: three to a light, all of them in extra")
 
-    def pixel_range(self, first: int, last: int) -> Samples:
-        """The samples of pixels first..last (exclusive), as one image row."""
-        start = int(self.counts[:first].sum())
-        stop = start + int(self.counts[first:last].sum())
+    def pixel_range(self, first: int, last: int, start: int, stop: int) -> Samples:
+        """Pixels first..last (exclusive), whose samples are start..stop, as one image row."""
         return Samples(
             (1, 1, last - first),
             self.counts[first:last],
             self.weight[start:stop],
             self.coverage[start:stop],
             {role: values[start:stop] for role, values in self.roles.items()},
+            None if self.extra is None else self.extra[start:stop],
+            self.lights,
         )

@@ -26,13 +26,15 @@ FloatArray = npt.NDArray[np.float32]
 class FrameLayers:
     """A denoised frame's layers, float32, front layer first: see `model.compositing.Layers`.
 
-    color (L, 3, H, W), weight (L, H, W), coverage (L, H, W), depth (L, H, W), inf where a layer has no hit
+    color (L, 3, H, W), weight (L, H, W), coverage (L, H, W), depth (L, H, W), inf where a layer has no hit,
+    extra (L, E, H, W) what each layer adds to the channels that the reader carries
     """
 
     color: FloatArray
     weight: FloatArray
     coverage: FloatArray
     depth: FloatArray
+    extra: FloatArray
 
     def beauty(self) -> FloatArray:
         """(H, W, 3) radiance."""
@@ -45,9 +47,11 @@ class FrameLayers:
         return alpha
 
 
-def to_model(block: PathSamples, roles: tuple[str, ...], depth: float, device: torch.device) -> Samples:
+def to_model(block: PathSamples, roles: tuple[str, ...], depth: float, device: torch.device, lights: int = 0
+             ) -> Samples:
     """A block of decoded samples as the model's input, with those of the roles that the block has.
 
+    The first `lights` of the block's extra columns are parts of the radiance.
     A depth of 0 is an unknown one and becomes `depth`, the frame's scale, which tells the network nothing.
     """
     height, width = block.counts.shape
@@ -64,6 +68,8 @@ def to_model(block: PathSamples, roles: tuple[str, ...], depth: float, device: t
         weight=tensor(block.weight),
         coverage=tensor(block.coverage),
         roles={role: tensor(values) for role, values in block.roles.items() if role in roles},
+        extra=tensor(block.extra) if block.extra.shape[1] else None,
+        lights=lights,
     )
 
 
@@ -86,9 +92,12 @@ def denoise_bands(
         weight=torch.empty(1, layers, *size),
         coverage=torch.empty(1, layers, *size),
         depth=torch.empty(1, layers, *size),
+        extra=torch.empty(1, layers, reader.carried, *size),
     )
     for number, band in enumerate(bands):
-        samples = to_model(reader.read(window.ymin + band.read0, window.ymin + band.read1), roles, scale.depth, device)
+        block = reader.read(window.ymin + band.read0, window.ymin + band.read1)
+        samples = to_model(block, roles, scale.depth, device, reader.carried_lights)
+        del block
         result = net(samples, scale, layers, fill=False)
         rows = slice(band.y0 - band.read0, band.y1 - band.read0)
         for whole, part in zip(_planes(frame), _planes(result), strict=True):
@@ -98,4 +107,4 @@ def denoise_bands(
 
 
 def _planes(layers: Layers) -> tuple[torch.Tensor, ...]:
-    return layers.color, layers.weight, layers.coverage, layers.depth
+    return layers.color, layers.weight, layers.coverage, layers.depth, layers.extra
