@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from deep_io import read_deep
 from deep_io.atomic import atomic_output
+from deep_io.errors import UsageError
 from deep_io.flat import read_flat
 from model.metrics import common_scale
 from pipelines.rendering.output import example_files
@@ -48,9 +49,11 @@ def strip(stem: Path) -> Picture:
 
 
 def write_contact_sheet(target: Path, stems: list[Path]) -> None:
-    """A PNG of up to SHOWN of the examples `stems`, spread evenly over them."""
-    from PIL import Image
-
+    """A PNG of up to SHOWN of the examples `stems`, spread evenly over them. Raises UsageError without Pillow."""
+    try:
+        from PIL import Image
+    except ImportError as missing:
+        raise UsageError(f"{target}: needs Pillow ({missing}): pip install 'lbmc[render]'") from missing
     chosen = [stems[i] for i in np.unique(np.linspace(0, len(stems) - 1, min(SHOWN, len(stems))).astype(int))]
     strips = [strip(stem) for stem in chosen]
     height, width = (max(s.shape[axis] for s in strips) for axis in (0, 1))

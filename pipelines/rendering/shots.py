@@ -26,7 +26,7 @@ ATTEMPTS = 12
 CLAMP = 60.0
 BRIGHTNESS_STOPS = 1.5  # standard deviation
 # relMSE of eight samples, estimated from a pilot: easier scenes teach little, harder ones are noise alone.
-EASIEST, EASY, HARDEST = 0.05, 0.25, 2.5
+EASIEST, EASY, HARDEST = 0.05, 0.25, 2.0
 EASY_KEPT = 0.5
 LIT, CONTRAST = 0.75, 0.08  # least share of surfaces that any path lights, least deviation of log brightness
 PILOT, PILOT_SAMPLES = 64, 16
