@@ -115,9 +115,10 @@ def count(config: Config) -> Cost:
     stages.append(_unet(context_inputs(config), config.unet))
     if config.layered:
         outputs = config.partition_logits + int(config.confidence)
-        own = config.embedding + int(config.depth_prior)
+        priors = int(config.depth_prior) + int(config.confidence)  # inputs, and parameters of their own
+        own = config.embedding + priors
         parameters, pixel, sample = _split_mlp(config.unet.out_channels, own, (*config.partitioner, outputs))
-        stages.append(Stage("partitioner", parameters + int(config.depth_prior), sample=sample, pixel=pixel))
+        stages.append(Stage("partitioner", parameters + priors, sample=sample, pixel=pixel))
     if config.kernel == "affinity":
         stages += _affinity(config)
     elif config.variant == "sample_splat":

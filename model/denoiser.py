@@ -27,11 +27,13 @@ from model.guided import (
 )
 from model.networks import Mlp, Products, UNet
 from model.partition import (
+    OUTLIER_START,
     PRIOR_WINDOW,
     basic_values,
     extra_values,
     initial_logits,
     kept_logits,
+    outlierness,
     relative_depth,
     splat,
 )
@@ -41,6 +43,7 @@ from model.samples import Samples, Segments
 
 CHUNK_SAMPLES = 32768  # per-sample stages at inference: about 4 MB of activations at width 32
 CONFIDENCE_START = -3.0  # softplus(-3) = 0.05: nearly unbiased at the start
+OUTLIER_RATE_START = -1.5  # softplus(-1.5) = 0.2: what each log unit beyond OUTLIER_START adds to gamma
 
 
 class Denoiser(nn.Module):
@@ -66,10 +69,12 @@ class Denoiser(nn.Module):
         context, embedding = config.unet.out_channels, config.embedding
         if config.layered:
             outputs = config.partition_logits + int(config.confidence)
-            mine = embedding + int(config.depth_prior)
+            mine = embedding + int(config.depth_prior) + int(config.confidence)
             self.partitioner = Mlp([context, mine], (*config.partitioner, outputs))
         if config.depth_prior:
             self.prior_strength = nn.Parameter(torch.tensor(1.5))
+        if config.confidence:
+            self.outlier_rate = nn.Parameter(torch.tensor(OUTLIER_RATE_START))
         if config.kernel == "direct":
             finest_first = [context, *(widths[-1] for widths in reversed(config.unet.decoder[:-1]))]
             self.generators = make_generators(config, finest_first)
@@ -123,9 +128,7 @@ class Denoiser(nn.Module):
         """
         config = self.config
         keep = kept_logits(layers or config.layers, config.partition_logits)
-        relative = None
-        if config.depth_prior and "depth" in samples.roles:
-            relative = relative_depth(samples, Segments(samples.counts), scale)
+        relative = self._surroundings(samples, scale)
         contexts, embedding = self._context(samples, relative, scale)
         context = _rows(contexts[0], samples.shape)  # (P, C)
         if config.variant == "sample_splat":
@@ -142,9 +145,7 @@ class Denoiser(nn.Module):
         keep = kept_logits(layers or self.config.layers, self.config.partition_logits)
         if not self.config.layered:
             return torch.ones_like(samples.weight[:, None])
-        relative = None
-        if self.config.depth_prior and "depth" in samples.roles:
-            relative = relative_depth(samples, Segments(samples.counts), scale)
+        relative = self._surroundings(samples, scale)
         contexts, _ = self._context(samples, relative, scale)
         context = _rows(contexts[0], samples.shape)
         shares = []
@@ -152,6 +153,17 @@ class Denoiser(nn.Module):
             embedding = self.reducer(part, scale)
             shares.append(self._partition(part, embedding, part_relative, context[rows], scale, keep)[0].exp())
         return torch.cat(shares, 0)
+
+    def _surroundings(self, samples: Samples, scale: FrameScale) -> Tensor | None:
+        """(N, 1 or 2) each sample against its neighbourhood: depth (0: unknown), then radiance; None for neither."""
+        segments, columns = Segments(samples.counts), []
+        if self.config.depth_prior:
+            known = "depth" in samples.roles
+            unknown = torch.zeros_like(samples.weight[:, None])
+            columns.append(relative_depth(samples, segments, scale) if known else unknown)
+        if self.config.confidence:
+            columns.append(outlierness(samples, segments, scale))
+        return torch.cat(columns, 1) if columns else None
 
     # --- context ---------------------------------------------------------------------------------------------------
 
@@ -199,20 +211,20 @@ class Denoiser(nn.Module):
                    scale: FrameScale, keep: list[int]) -> tuple[Tensor, Tensor | float]:
         """(N, L) log of the partition, and what the confidence takes from the log of each weight, (N, 1)."""
         config = self.config
-        mine = embedding
-        if config.depth_prior:
-            offset = relative if relative is not None else torch.zeros_like(samples.weight[:, None])
-            mine = torch.cat([embedding, offset.to(embedding.dtype)], 1)
+        mine = embedding if relative is None else torch.cat([embedding, relative.to(embedding.dtype)], 1)
         shared = Segments(samples.counts).expand(self.partitioner.first(0, context))
         raw = self.partitioner.rest(shared + self.partitioner.first(1, mine)).to(samples.weight.dtype)
         logits = raw[:, keep]
-        if relative is not None:
-            logits = logits + initial_logits(relative, self.prior_strength, keep, config.partition_logits)
+        if config.depth_prior and relative is not None:
+            logits = logits + initial_logits(relative[:, :1], self.prior_strength, keep, config.partition_logits)
         log_partition = torch.log_softmax(logits, 1)
         if not config.confidence:
             return log_partition, 0.0
         brightness = log_radiance(samples.roles["radiance"].amax(1, keepdim=True), scale.exposure)
-        return log_partition, F.softplus(raw[:, -1:]) * brightness
+        assert relative is not None
+        beyond = (relative[:, -1:] - OUTLIER_START).clamp_min(0)
+        gamma = F.softplus(raw[:, -1:]) + F.softplus(self.outlier_rate) * beyond
+        return log_partition, gamma * brightness
 
     # --- kernels, filter, compositing ------------------------------------------------------------------------------
 

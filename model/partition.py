@@ -12,10 +12,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from model.features import FrameScale, log_depth
+from model.features import FrameScale, log_depth, log_radiance
 from model.samples import Samples, Segments
 
 PRIOR_WINDOW = 9  # pixels; the neighbourhood that depth is compared with
+OUTLIER_WINDOWS = (3, 9)  # pixels; the neighbourhoods that a sample's radiance is compared with
+OWN_SHARE = 0.5
+OUTLIER_START = 4.0  # log units above the surroundings from which a sample's confidence falls by itself
 PRIOR_SPREAD = 0.1  # log units: depth differences well under this are one surface
 PRIOR_LIMIT = 4.0  # standard deviations
 
@@ -125,6 +128,25 @@ def splat(log_weight: Tensor, log_partition: Tensor, values: Tensor, segments: S
         log_w=log_w,
         values=sums[..., :-1] / safe[..., None],
     )
+
+
+def outlierness(samples: Samples, segments: Segments, scale: FrameScale) -> Tensor:
+    """(N, 1): how far above its surroundings a sample is, in log radiance; about 0 for one that agrees with them.
+
+    log(1 + exposure L) less the largest of: its mean over each of OUTLIER_WINDOWS pixels around, and OWN_SHARE of its
+    mean over the sample's own pixel. A lone bright sample is far above all of them, also where its pixel has no other;
+    a small lamp, bright in all samples of its pixels, is not.
+    """
+    batch, height, width = samples.shape
+    brightness = log_radiance(samples.roles["radiance"].amax(1, keepdim=True), scale.exposure)
+    weight = samples.weight[:, None]
+    sums = segments.sum(torch.cat([weight, weight * brightness], 1))  # (P, 2)
+    picture = sums.view(batch, height, width, 2).permute(0, 3, 1, 2)
+    around = OWN_SHARE * sums[:, 1]
+    for window in OUTLIER_WINDOWS:
+        blurred = F.avg_pool2d(picture, window, 1, window // 2).permute(0, 2, 3, 1).reshape(-1, 2)
+        around = torch.maximum(around, blurred[:, 1] / torch.where(blurred[:, 0] > 0, blurred[:, 0], 1))
+    return brightness - segments.expand(around[:, None])
 
 
 def initial_logits(relative: Tensor | None, strength: Tensor, keep: Sequence[int], logits: int) -> Tensor | float:

@@ -70,7 +70,7 @@ def pixel_rows(
     """(P, context_inputs) what the context network sees of each pixel, 0 for one without samples.
 
     The weighted mean of the embeddings (N, E). Without a reducer also their population variance. With
-    `config.statistics` also that, and PIXEL_STATISTICS numbers; `relative` (N, 1) is depth against the neighbourhood.
+    `config.statistics` also that, and PIXEL_STATISTICS numbers; `relative` begins with depth against the surroundings.
     """
     segments = Segments(samples.counts)
     weight = samples.weight[:, None]
@@ -83,7 +83,7 @@ def pixel_rows(
         return torch.cat([mean, segments.weighted_sum(weight, deviation * deviation)[:, 0]], 1)
     radiance = samples.roles["radiance"]
     luminance = radiance.mean(1, keepdim=True).clamp(-LUMINANCE_LIMIT, LUMINANCE_LIMIT)
-    offset = torch.zeros_like(luminance) if relative is None else relative
+    offset = torch.zeros_like(luminance) if relative is None or not config.depth_prior else relative[:, :1]
     moments = torch.cat([embedding, radiance, luminance, offset], 1)
     mean = segments.weighted_sum(weight, moments)[:, 0]
     deviation = moments - segments.expand(mean)

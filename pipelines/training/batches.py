@@ -83,7 +83,7 @@ def _augment(
     samples[..., CHANNELS["radiance"]] *= gain
     if rng.random() < how.fireflies:
         hit = rng.random(samples.shape[:3]) < 10 ** rng.uniform(-4.5, -3)
-        samples[hit, CHANNELS["radiance"]] *= 10 ** rng.uniform(2, 5, (int(hit.sum()), 1)).astype(np.float32)
+        samples[hit, CHANNELS["radiance"]] *= 10 ** rng.uniform(1, 4.5, (int(hit.sum()), 1)).astype(np.float32)
     return samples, target * np.float32(gain), gain
 
 

@@ -15,7 +15,7 @@ class Augmentation:
     permute_colors: bool = True
     exposure_stops: float = 1.0  # standard deviation of the exposure's jitter, log2
     drop_roles: float = 0.15  # probability that a batch loses some roles
-    fireflies: float = 0.05  # probability that a crop gets samples of 1e2..1e5 times their radiance
+    fireflies: float = 0.25  # probability that a crop gets samples of 10..10^4.5 times their radiance
 
 
 @dataclass(frozen=True)
