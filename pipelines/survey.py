@@ -15,6 +15,7 @@ import numpy.typing as npt
 from deep_io.path_samples import PathSamples
 
 EXPOSURE_BIN = 16  # pixels along a bin's side
+MIXED_DEPTH = 0.1  # of the depth: hits of a pixel that are closer together are one surface
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class Survey:
     depth : median over the pixels of their hits' mean depth, scene units; 1 without depth or hits
     varying : roles whose values differ anywhere among the hits; the others are constant over the whole frame
     pixels, empty_pixels, samples, hits : counts
+    mixed : share of the pixels in which depth mixes: hits further apart than MIXED_DEPTH, or hits and misses
     luminance : mean over pixels of the samples' mean radiance
     repairs : non-finite values that were mended, by role
     """
@@ -36,6 +38,7 @@ class Survey:
     empty_pixels: int
     samples: int
     hits: int
+    mixed: float
     luminance: float
     repairs: dict[str, int]
 
@@ -47,7 +50,7 @@ def survey(blocks: Iterable[PathSamples]) -> Survey:
     ranges: dict[str, tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]] = {}
     depths: list[npt.NDArray[np.float64]] = []
     repairs: Counter[str] = Counter()
-    pixels = empty = samples = hits = 0
+    pixels = empty = samples = hits = mixed = 0
     total = 0.0
     top: int | None = None
     for block in blocks:
@@ -64,6 +67,7 @@ def survey(blocks: Iterable[PathSamples]) -> Survey:
                 ranges[role] = low, high
         if "depth" in block.roles:
             depths.append(pixel_depth(block))
+            mixed += int(_mixes_depth(block).sum())
         repairs.update(block.repairs)
         pixels += block.counts.size
         empty += int((block.counts == 0).sum())
@@ -79,6 +83,7 @@ def survey(blocks: Iterable[PathSamples]) -> Survey:
         empty_pixels=empty,
         samples=samples,
         hits=hits,
+        mixed=mixed / max(pixels, 1),
         luminance=total / max(pixels, 1),
         repairs=dict(repairs),
     )
@@ -115,6 +120,16 @@ def pixel_depth(block: PathSamples) -> npt.NDArray[np.float64]:
     counts = _pixel_sums(known.astype(np.float64), block)
     sums = _pixel_sums(np.where(known, depth, 0), block)
     return sums[counts > 0] / counts[counts > 0]
+
+
+def _mixes_depth(block: PathSamples) -> npt.NDArray[np.bool_]:
+    """(M,) for each pixel that has samples: whether its hits are far apart in depth, or mixed with misses."""
+    starts = block.offsets[:-1][block.counts.reshape(-1) > 0]
+    if not starts.size:
+        return np.zeros(0, np.bool_)
+    depth = np.where(block.coverage > 0, block.roles["depth"][:, 0], np.float32(np.inf))
+    near, far = np.minimum.reduceat(depth, starts), np.maximum.reduceat(depth, starts)
+    return (far > near * np.float32(1 + MIXED_DEPTH)) & np.isfinite(near)
 
 
 def median_depth(depths: list[npt.NDArray[np.float64]]) -> float:
