@@ -82,7 +82,7 @@ def test_a_black_frame_has_exposure_one_and_a_frame_without_hits_depth_one() -> 
 
 
 def test_depth_mixes_where_surfaces_or_the_sky_share_a_pixel() -> None:
-    depth = np.array([2.0, 2.1, 2.0, 3.0, 2.0, 0.0, 0.0, 0.0], np.float32)[:, None]  # two samples in each of four pixels
+    depth = np.array([2.0, 2.1, 2.0, 3.0, 2.0, 0.0, 0.0, 0.0], np.float32)[:, None]  # two samples a pixel
     coverage = np.array([1, 1, 1, 1, 1, 0, 0, 0], np.float32)
     roles = {"radiance": np.ones((8, 3), np.float32), "depth": depth}
     counts = np.full((1, 4), 2, np.int32)
