@@ -10,6 +10,7 @@ so that over brings every layer back as T_l * RGB_l = C_l, to the rounding of it
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,15 +31,15 @@ FLOAT_GAIN = 16.0
 # Depth is rounded to this many significant bits: finer than a filtered depth is known, and a third of its bytes.
 DEPTH_BITS = 16
 
-COLOR, ALPHA, WEIGHT, DEPTH = slice(0, 3), 3, 4, 5  # the planes of a stack
-SUMS = slice(0, 5)  # those that add up when layers are pooled
+COLOR, ALPHA, WEIGHT, DEPTH = slice(0, -3), -3, -2, -1  # the planes of a stack
+SUMS = slice(0, -1)  # those that add up when layers are pooled
 
 
 @dataclass(frozen=True)
 class OverLayers:
     """Layers of P pixels in over form, front first, in the type to be written.
 
-    color    (L, 3, P) premultiplied, and alpha (L, P); both 0 where a layer is not present
+    color    (L, C, P) premultiplied, and alpha (L, P); both 0 where a layer is not present
     depth    (L, P) float32; MISS_DEPTH where a layer is not present or has no hit
     present  (L, P) which layers hold anything
     clamped  values beyond the type's range although nothing lies in front of them
@@ -56,7 +57,8 @@ def encode_layers(color: Planes, weight: Planes, coverage: Planes, depth: Planes
     """Layers in over form.
 
     Parameters
-        color     (L, 3, P) C_l, what each layer adds to the beauty; finite, may be negative
+        color     (L, C, P) C_l, what each layer adds to the beauty's R, G, B and to further channels; finite, may be
+                  negative
         weight    (L, P) V_l, its share of the pixel; >= 0, sums to 1, or to 0 in a pixel that nothing reached
         coverage  (L, P) A_l, what it adds to the beauty's alpha; 0 <= A_l <= V_l
         depth     (L, P) not finite where a layer has no hit; None where depth is not known at all. Rounded to
@@ -69,7 +71,7 @@ def encode_layers(color: Planes, weight: Planes, coverage: Planes, depth: Planes
     last, is sum C_l and sum A_l: within 2^-10 sum |C_l| + 2^-23 in half, within 1e-5 sum |C_l| in float.
     """
     layers, pixels = weight.shape
-    planes = np.empty((layers, 6, pixels), np.float32)
+    planes = np.empty((layers, color.shape[1] + 3, pixels), np.float32)
     planes[:, COLOR], planes[:, ALPHA], planes[:, WEIGHT] = color, coverage, weight
     planes[:, DEPTH] = MISS_DEPTH
     if depth is not None:
@@ -81,15 +83,18 @@ def encode_layers(color: Planes, weight: Planes, coverage: Planes, depth: Planes
         return _encode(planes, slot, _starts(planes, by_depth), np.dtype(dtype), in_slots=not by_depth)
 
 
-def deep_samples(layers: OverLayers, window: Window) -> DeepSamples:
-    """The layers that are present as deep samples R, G, B, A, Z of the pixels of a window, row by row."""
+def deep_samples(layers: OverLayers, window: Window, names: Sequence[str] = ("R", "G", "B")) -> DeepSamples:
+    """The layers that are present as deep samples of the pixels of a window, row by row.
+
+    `names` are those of the planes of `color`; A and Z are the others.
+    """
     present = np.ascontiguousarray(layers.present.T)  # (P, L): the layers of a pixel are its samples
 
     def samples(plane: NDArray[Any]) -> NDArray[Any]:
         values: NDArray[Any] = plane.T[present]
         return values
 
-    channels = {name: samples(layers.color[:, k]) for k, name in enumerate("RGB")}
+    channels = {name: samples(layers.color[:, k]) for k, name in enumerate(names)}
     channels |= {"A": samples(layers.alpha), "Z": samples(layers.depth)}
     counts = layers.present.sum(axis=0, dtype=np.int32).reshape(window.height, window.width)
     return DeepSamples(counts, channels, window)
@@ -142,7 +147,7 @@ def _encode(planes: Planes, slot: NDArray[np.int8], starts: Flags, dtype: np.dty
     present = (alpha > 0) | rounded.any(axis=1)
     depth = np.where(present, pooled[:, DEPTH], np.float32(MISS_DEPTH))
     if in_slots:
-        for plane in (rounded.swapaxes(1, 2), alpha, depth, present):  # each (L, P) or (L, P, 3)
+        for plane in (rounded.swapaxes(1, 2), alpha, depth, present):  # each (L, P) or (L, P, C)
             _move(plane, owner, starts, MISS_DEPTH if plane is depth else 0)
     if again.size:
         fewer = starts[:, again]
@@ -170,7 +175,7 @@ def _pool(planes: Planes, slot: NDArray[np.int8], starts: Flags) -> tuple[Planes
 
 
 def _composite(pooled: Planes, starts: Flags, dtype: np.dtype[Any]) -> tuple[Planes, NDArray[np.floating[Any]]]:
-    """C_l / T (L, 3, P), not yet rounded, and the rounded alphas (L, P)."""
+    """C_l / T (L, C, P), not yet rounded, and the rounded alphas (L, P)."""
     below_one = np.nextafter(dtype.type(1), dtype.type(0))
     color = np.empty_like(pooled[:, COLOR])
     alpha = np.empty(starts.shape, dtype)

@@ -51,6 +51,20 @@ job_options = together(
         help="Scale of the radiance before the network.  [default: measured]",
     ),
     option("--exposure-from", metavar="FRAME|FILE", help="Frame whose exposure and depth scale serve all."),
+    option(
+        "--aov",
+        "aovs",
+        multiple=True,
+        metavar="NAME",
+        help="Also denoise this layer, channel or role of IN, by the beauty's own kernels. Repeatable.",
+    ),
+    option(
+        "--ids",
+        multiple=True,
+        metavar="NAME",
+        help="Also write this id channel of IN with the beauty, as ranked pairs (id, weight) the Cryptomatte way. "
+        "Repeatable.",
+    ),
     reading_options,
 )
 """Frames, network and how the input is read."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,8 @@ from model import zoo
 from model.denoiser import Denoiser
 from model.features import FrameScale
 from pipelines import __version__
+from pipelines.aovs import Aovs, beauty_channels, find_aovs
+from pipelines.ids import IdChannel, find_ids, ranked_ids
 from pipelines.inference import FrameLayers, denoise_bands
 from pipelines.jobs import FrameSkippedError, JobReport, run_frames
 from pipelines.keep import kept_channels
@@ -60,6 +62,8 @@ class FramePlan:
     bands: list[Band]
     memory: int
     mapping: list[str]
+    aovs: Aovs = field(default_factory=Aovs)
+    ids: Sequence[IdChannel] = ()
 
     def lines(self) -> list[str]:
         """The plan, for `--dry-run`."""
@@ -71,6 +75,8 @@ class FramePlan:
             f"roles in use: {', '.join(self.roles)}",
             f"exposure: {self.shot.scale.exposure:.6g}, depth scale: {self.shot.scale.depth:.6g}",
             f"layers: {self.shot.layers}",
+            *(f"AOV: {', '.join(group.outputs)} filtered as {group.kind}" for group in self.aovs.groups),
+            *(f"ids: {one.channel} ranked as {one.base}" for one in self.ids),
             f"bands: {len(self.bands)}, about {self.memory / 2**20:.0f} MiB",
         ]
 
@@ -123,6 +129,9 @@ class Job:
     def plan(self, source: Path, reader: SampleReader, update: Callable[[float], None]) -> FramePlan:
         """Surveys a frame and decides; the first frame decides for the shot."""
         window = reader.header.data_window
+        aovs = find_aovs(self.options.aovs, reader.header, reader.mapping, os.fspath(source))
+        ids = find_ids(self.options.ids, reader.header, os.fspath(source))
+        reader.carry(aovs.channels("light"), aovs.channels("data"))
         rows = 0
 
         def counted() -> Any:
@@ -143,7 +152,7 @@ class Job:
         bands = plan_bands(window.height, window.width, per_pixel, self.net.reach, self.net.stride, self.memory)
         tallest = max(band.read1 - band.read0 for band in bands)
         needed = memory_needed(tallest, window.width, per_pixel)
-        return FramePlan(source, seen, self.shot, roles, bands, needed, reader.mapping.lines())
+        return FramePlan(source, seen, self.shot, roles, bands, needed, reader.mapping.lines(), aovs, ids)
 
     def _decide(self, seen: Survey, weighting: str) -> Shot:
         """The shot's scale, both numbers of it, comes from one frame: chunks of a shot that name it agree exactly."""
@@ -197,21 +206,35 @@ class Job:
     def write(self, frame: sequences.Frame, wanted: list[Path], plan: FramePlan, layers: FrameLayers, header: Header
               ) -> int:
         """Writes those of a frame's files that are wanted; returns how many values were clamped to half's range."""
-        channels, clamped = self.beauty(layers)
+        channels, attributes, clamped = self.beauty(frame, plan, layers)
         if self.options.keep:
             source, part = os.fspath(frame.source), self.options.part
             kept = kept_channels(source, part, plan.shot.weighting, self.options.keep, KEEP_BLOCK_BYTES)
             channels = {**kept, **channels}
         for target in wanted:
             with atomic_output(target) as temporary:
-                write_flat(temporary, channels, header, self.options.compression, self.provenance())
+                write_flat(temporary, channels, header, self.options.compression,
+                           {**self.provenance(), **attributes})
         return clamped
 
-    def beauty(self, layers: FrameLayers) -> tuple[dict[str, npt.NDArray[Any]], int]:
-        """R, G, B and A in the type to be written, and how many values were clamped to it."""
-        color, clamped = to_pixel_type(layers.beauty(), self.options.pixel_type)
-        alpha, _ = to_pixel_type(layers.alpha(), self.options.pixel_type)
-        return {**{name: np.ascontiguousarray(color[..., k]) for k, name in enumerate("RGB")}, "A": alpha}, clamped
+    def beauty(self, frame: sequences.Frame, plan: FramePlan, layers: FrameLayers
+               ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, str], int]:
+        """R, G, B, A, AOVs and ids to be written, attributes for them, and how many values were clamped."""
+        beauty = layers.beauty()
+        planes = {**beauty_channels(plan.aovs, layers), **{name: beauty[..., k] for k, name in enumerate("RGB")},
+                  "A": layers.alpha()}
+        channels: dict[str, npt.NDArray[Any]] = {}
+        clamped = 0
+        for name, plane in planes.items():
+            kind = "float" if name == plan.aovs.depth else self.options.pixel_type
+            values, beyond = to_pixel_type(np.ascontiguousarray(plane), kind)
+            channels[name] = values
+            clamped += beyond
+        if not plan.ids:
+            return channels, {}, clamped
+        with self.open(frame.source) as reader:
+            ids, attributes = ranked_ids(reader, self.options.part, plan.ids)
+        return {**ids, **channels}, attributes, clamped
 
     def provenance(self) -> dict[str, str]:
         """Header attributes that say what made a file; no times, so that the same input gives the same bytes."""

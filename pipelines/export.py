@@ -6,7 +6,7 @@ layers become over form is deep_io/layer_encoding.py's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -73,34 +73,36 @@ class ExportJob(Job):
     def write(self, frame: Frame, wanted: list[Path], plan: FramePlan, layers: FrameLayers, header: Header) -> int:
         """Writes the layers in the form asked for; returns how many values were clamped to half's range."""
         if self.options.form == "deep":
-            return self._write_deep(wanted[0], layers, header)
-        pictures, clamped = self._pictures(layers, "depth" in plan.roles)
-        beauty, clamped_too = self.beauty(layers)
+            return self._write_deep(wanted[0], plan, layers, header)
+        pictures, clamped = self._pictures(layers, ("R", "G", "B", *plan.aovs.outputs), "depth" in plan.roles)
         attributes = self._attributes(len(pictures), "contributions" if self.options.contributions else "over")
 
-        def image(channels: Channels, name: str = "") -> FlatImage:
-            return FlatImage.of(channels, header, name, attributes)
+        def image(channels: Channels, name: str = "", more: Mapping[str, object] | None = None) -> FlatImage:
+            return FlatImage.of(channels, header, name, {**attributes, **(more or {})})
 
         if self.options.form == "files":
             files = {path: [image(picture)] for path, picture in zip(self.targets(frame), pictures, strict=True)}
-            clamped_too = 0
-        elif self.options.form == "channels":
-            named = {f"layer{number}.{name}": plane for number, picture in enumerate(pictures)
-                     for name, plane in picture.items()}
-            files = {wanted[0]: [image({**beauty, **named})]}
         else:
-            parts = [image(picture, f"layer{number}") for number, picture in enumerate(pictures)]
-            files = {wanted[0]: [image(beauty, "beauty"), *parts]}
+            beauty, more, clamped_too = self.beauty(frame, plan, layers)
+            clamped += clamped_too
+            if self.options.form == "channels":
+                named = {f"layer{number}.{name}": plane for number, picture in enumerate(pictures)
+                         for name, plane in picture.items()}
+                files = {wanted[0]: [image({**beauty, **named}, more=more)]}
+            else:
+                parts = [image(picture, f"layer{number}") for number, picture in enumerate(pictures)]
+                files = {wanted[0]: [image(beauty, "beauty", more), *parts]}
         with ExitStack() as stack:  # several files appear together, after the last of them is written
             for path in wanted:
                 write_flat_parts(stack.enter_context(atomic_output(path)), files[path], self.options.compression)
-        return clamped + clamped_too
+        return clamped
 
-    def _write_deep(self, target: Path, layers: FrameLayers, header: Header) -> int:
+    def _write_deep(self, target: Path, plan: FramePlan, layers: FrameLayers, header: Header) -> int:
+        names = ("R", "G", "B", *plan.aovs.outputs)
         # No deepImageState: the OpenEXR module for Python cannot open a file that has it.
         attributes = {**kept_attributes(header), **self._attributes(len(layers.weight), "over"),
                       WEIGHTING_ATTRIBUTE: attribute("over")}
-        dtypes: dict[str, Any] = {**dict.fromkeys("RGBA", self._dtype), "Z": np.float32}
+        dtypes: dict[str, Any] = {**dict.fromkeys((*names, "A"), self._dtype), "Z": np.float32}
         deep = Header(channels_of(dtypes), header.data_window, header.display_window, pixel_aspect=header.pixel_aspect,
                       attributes=attributes)
         clamped, window = 0, header.data_window
@@ -108,15 +110,16 @@ class ExportJob(Job):
                                                             self.options.threads, small=True) as writer:
             for rows in _row_blocks(*layers.weight.shape[1:]):
                 block = encode_rows(layers, rows, self._dtype, by_depth=True)
-                writer.write(deep_samples(block, window.rows(window.ymin + rows.start, window.ymin + rows.stop)))
+                here = window.rows(window.ymin + rows.start, window.ymin + rows.stop)
+                writer.write(deep_samples(block, here, names))
                 clamped += block.clamped
         return clamped
 
-    def _pictures(self, layers: FrameLayers, with_depth: bool) -> tuple[list[Channels], int]:
+    def _pictures(self, layers: FrameLayers, names: Sequence[str], with_depth: bool) -> tuple[list[Channels], int]:
         """One set of channels per layer, over form or contributions, and how many values were clamped."""
         number, height, width = layers.weight.shape
         pictures: list[Channels] = [
-            {**{name: np.empty((height, width), self._dtype) for name in "RGBA"},
+            {**{name: np.empty((height, width), self._dtype) for name in (*names, "A")},
              **({"Z": np.empty((height, width), np.float32)} if with_depth else {})} for _ in range(number)]
         clamped = 0
         for rows in _row_blocks(height, width):
@@ -126,7 +129,7 @@ class ExportJob(Job):
                 block = encode_rows(layers, rows, self._dtype, by_depth=False)
             clamped += block.clamped
             for picture, color, alpha, depth in zip(pictures, block.color, block.alpha, block.depth, strict=True):
-                for name, plane in (*zip("RGB", color, strict=True), ("A", alpha), ("Z", depth)):
+                for name, plane in (*zip(names, color, strict=True), ("A", alpha), ("Z", depth)):
                     if name in picture:
                         picture[name][rows] = plane.reshape(-1, width)
         return pictures, clamped
@@ -151,19 +154,26 @@ def export_frames(options: ExportOptions) -> JobReport[DenoisedFrame]:
 
 def encode_rows(layers: FrameLayers, rows: slice, dtype: npt.DTypeLike, by_depth: bool) -> OverLayers:
     """Some rows of the layers in over form, pixels row by row; see `deep_io.layer_encoding.encode_layers`."""
-    color, weight, coverage, depth = (plane[..., rows, :].reshape(*plane.shape[:-2], -1) for plane in (
-        layers.color, layers.weight, layers.coverage, layers.depth))
-    return encode_layers(color, weight, coverage, depth, dtype, by_depth)
+    weight, coverage, depth = (plane[:, rows].reshape(len(plane), -1) for plane in (
+        layers.weight, layers.coverage, layers.depth))
+    return encode_layers(_color_rows(layers, rows), weight, coverage, depth, dtype, by_depth)
 
 
 def contribution_rows(layers: FrameLayers, rows: slice, pixel_type: str) -> OverLayers:
     """Some rows of the layers as what each adds to the beauty and its alpha: their plain sum is the beauty."""
     number = len(layers.weight)
-    color, clamped = to_pixel_type(layers.color[:, :, rows].reshape(number, 3, -1), pixel_type)
+    color, clamped = to_pixel_type(_color_rows(layers, rows), pixel_type)
     alpha, _ = to_pixel_type(layers.coverage[:, rows].reshape(number, -1), pixel_type)
     depth = layers.depth[:, rows].reshape(number, -1)
     return OverLayers(color, alpha, np.where(np.isfinite(depth), depth, np.float32(MISS_DEPTH)),
                       layers.weight[:, rows].reshape(number, -1) > 0, clamped)
+
+
+def _color_rows(layers: FrameLayers, rows: slice) -> npt.NDArray[np.float32]:
+    """(L, 3 + E, P) radiance and AOVs of some rows."""
+    planes = [layers.color, layers.extra] if layers.extra.size else [layers.color]
+    flat = [plane[:, :, rows].reshape(*plane.shape[:2], -1) for plane in planes]
+    return np.concatenate(flat, axis=1) if len(flat) > 1 else flat[0]
 
 
 def layer_path(target: Path, layer: int) -> Path:

@@ -34,5 +34,8 @@ class ExportOptions(DenoiseOptions):
         if self.form == "deep" and self.contributions:
             raise ValueError("contributions are summed, but deep samples are composited by over; choose --form parts, "
                              "channels or files for them")
+        if self.ids and self.form in ("deep", "files"):
+            raise ValueError(f"ids go with the beauty, which --form {self.form} has not; choose --form parts or "
+                             f"channels, or lbmc denoise")
         if self.form == "deep" and self.compression not in DEEP_COMPRESSIONS:
             raise ValueError(f"deep files are compressed with {', '.join(DEEP_COMPRESSIONS)}, not {self.compression}")

@@ -83,6 +83,10 @@ class DenoiseOptions:
     """Type of the written colour channels. Depth is always float."""
     compression: str = "zip"
     """One of COMPRESSIONS."""
+    aovs: tuple[str, ...] = ()
+    """Channel groups filtered by the beauty's own partition and kernels: layers, channels or roles."""
+    ids: tuple[str, ...] = ()
+    """Id channels, written as ranked pairs of id and weight, not filtered."""
     keep: tuple[str, ...] = ()
     """Other channels of the input to keep, as weighted pixel means: names, layers (`diffuse`) or globs (`light_*`)."""
 

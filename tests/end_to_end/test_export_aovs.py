@@ -1,0 +1,149 @@
+"""`--aov` and `--ids`, on denoise and export-layers: lights sum to the beauty, ids are ranked and not filtered."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from deep_io import DeepSamples, Window, read_deep, read_headers
+from pipelines.ids import cryptomatte_hash
+from tests.end_to_end.compositor import picture
+from tests.end_to_end.scenes import noisy_scene, random_weights, read_flat, write_scene
+from tests.runner import in_process
+
+WINDOW = Window(-7, 3, 32, 26)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return random_weights(tmp_path_factory.mktemp("weights") / "random.safetensors")
+
+
+def scene_with_aovs() -> DeepSamples:
+    """In float, so that key + fill is the radiance; `fog` and `id` besides."""
+    samples = noisy_scene(5, WINDOW, dtype=np.float32)
+    rng = np.random.default_rng(1)
+    channels = samples.channels
+    for name in "RGB":
+        channels[f"key.{name}"] = (channels[name] * rng.random(samples.total)).astype(np.float32)
+        channels[f"fill.{name}"] = channels[name] - channels[f"key.{name}"]
+    channels["fog"] = rng.random(samples.total).astype(np.float32)
+    channels["id"] = np.where(channels["Z"] < 3, 7, 40).astype(np.uint32)
+    return samples
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene") / "in.exr", scene_with_aovs())
+
+
+def lbmc(command: str, source: Path, target: Path, model: Path, *words: object) -> Path:
+    run = in_process(command, source, target, "--model", model, *words)
+    assert run.code == 0, run.err
+    return target
+
+
+def test_lights_that_sum_to_the_beauty_are_denoised_to_its_sum(weights: Path, source: Path, tmp_path: Path) -> None:
+    plain, _ = read_flat(lbmc("denoise", source, tmp_path / "plain.exr", weights, "--pixel-type", "float"))
+    out, _ = read_flat(lbmc("denoise", source, tmp_path / "out.exr", weights, "--pixel-type", "float", "--aov", "key",
+                            "--aov", "fill", "--aov", "fog"))
+    assert set(out) == {*"RGBA", *(f"{light}.{name}" for light in ("key", "fill") for name in "RGB"), "fog"}
+    for name in "RGBA":
+        assert np.array_equal(out[name], plain[name])
+    for name in "RGB":
+        total = out[f"key.{name}"].astype(np.float64) + out[f"fill.{name}"]
+        assert (np.abs(total - out[name]) <= 1e-5 * np.abs(out[name])).all()
+    assert ((out["fog"] > 0) & (out["fog"] < 1)).all()
+
+
+def test_denoised_albedo_normal_and_depth_come_the_same_way(weights: Path, source: Path, tmp_path: Path) -> None:
+    out, _ = read_flat(lbmc("denoise", source, tmp_path / "out.exr", weights, "--aov", "albedo", "--aov", "N", "--aov",
+                            "depth"))
+    assert set(out) == {*"RGBA", "albedo.R", "albedo.G", "albedo.B", "N.X", "N.Y", "N.Z", "Z"}
+    assert out["Z"].dtype == np.float32
+    hits = out["A"] > 0.99
+    assert ((out["Z"] > 1.9) & (out["Z"] < 5.2))[hits].all()
+    assert (out["albedo.R"][hits] > 0.05).all()
+
+
+@pytest.mark.parametrize("form", ["parts", "channels", "files"])
+def test_the_layers_aovs_composite_to_the_beautys(form: str, weights: Path, source: Path, tmp_path: Path) -> None:
+    words = ("--pixel-type", "float", "--aov", "key", "--layers", 3)
+    beauty, _ = read_flat(lbmc("denoise", source, tmp_path / "beauty.exr", weights, *words))
+    out = lbmc("export-layers", source, tmp_path / "out.exr", weights, *words, "--form", form)
+    result, through = np.zeros((WINDOW.height, WINDOW.width, 3)), np.ones((WINDOW.height, WINDOW.width, 1))
+    for number in range(3):
+        path = out if form != "files" else tmp_path / f"out.layer{number}.exr"
+        image = oiio.ImageBuf(str(path), number + 1 if form == "parts" else 0, 0)
+        prefix = f"layer{number}." if form == "channels" else ""
+        names = image.spec().channelnames
+        pixels = image.get_pixels(oiio.FLOAT)
+        result += through * pixels[..., [names.index(f"{prefix}key.{name}") for name in "RGB"]]
+        through = through * (1 - pixels[..., [names.index(f"{prefix}A")]])
+    wanted = np.stack([beauty[f"key.{name}"] for name in "RGB"], -1)
+    assert np.abs(result - wanted).max() <= 1e-5 * np.abs(wanted).max()
+
+
+def test_the_deep_layers_carry_aovs_that_flatten_to_the_beautys(weights: Path, source: Path, tmp_path: Path) -> None:
+    words = ("--pixel-type", "float", "--aov", "key", "--aov", "fog")
+    beauty, _ = read_flat(lbmc("denoise", source, tmp_path / "beauty.exr", weights, *words))
+    deep = lbmc("export-layers", source, tmp_path / "deep.exr", weights, *words)
+    samples, _ = read_deep(deep)
+    assert set(samples.channels) == {*"RGBAZ", "key.R", "key.G", "key.B", "fog"}
+    flat = oiio.ImageBufAlgo.flatten(oiio.ImageBuf(str(deep)))
+    names = list(flat.spec().channelnames)
+    for name in ("key.R", "key.G", "key.B", "fog"):
+        made = flat.get_pixels(oiio.FLOAT)[..., names.index(name)]
+        assert np.abs(made - beauty[name]).max() <= 1e-5 * np.abs(beauty[name]).max()
+
+
+def test_ids_are_ranked_pairs_with_a_manifest(weights: Path, source: Path, tmp_path: Path) -> None:
+    out = lbmc("denoise", source, tmp_path / "out.exr", weights, "--ids", "id")
+    channels, _ = read_flat(out)
+    header = read_headers(out)[0]
+    keys = {key.rpartition("/")[2]: str(header.get(key)) for key in header.attributes if key.startswith("cryptomatte/")}
+    assert keys["name"] == "id"
+    assert (keys["hash"], keys["conversion"]) == ("MurmurHash3_32", "uint32_to_float32")
+    manifest = json.loads(keys["manifest"])
+    assert manifest == {number: f"{cryptomatte_hash(number):08x}" for number in ("7", "40")}
+    samples = scene_with_aovs()
+    near = np.zeros(samples.counts.size)
+    np.add.at(near, samples.pixel_index, (samples.channels["id"] == 7) & (samples.channels["A"] > 0))
+    wanted = (near / samples.counts.ravel()).reshape(samples.counts.shape)
+    seven = np.uint32(cryptomatte_hash("7"))
+    made = sum(np.where(channels[f"id00.{i}"].view(np.uint32) == seven, channels[f"id00.{w}"], 0) for i, w in
+               ("RG", "BA"))
+    assert np.allclose(made, wanted)
+    assert (channels["id00.G"] >= channels["id00.A"]).all()
+
+
+def test_ids_go_with_the_beauty_of_the_flat_forms(weights: Path, source: Path, tmp_path: Path) -> None:
+    out = lbmc("export-layers", source, tmp_path / "out.exr", weights, "--ids", "id", "--form", "parts")
+    assert "id00.R" in read_headers(out)[0].channel_names
+    assert "id00.R" not in read_headers(out)[1].channel_names
+    assert picture(out, "beauty").get_pixels(oiio.FLOAT)[..., 3].max() > 0
+    refused = in_process("export-layers", source, tmp_path / "deep.exr", "--model", weights, "--ids", "id")
+    assert refused.code == 2
+    assert "--form parts" in refused.err
+
+
+@pytest.mark.parametrize("command", ["denoise", "export-layers"])
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--aov", "rim"], "no AOV 'rim'; there are"),
+        (["--aov", "id"], "--ids id"),
+        (["--aov", "RGB"], "fill"),
+    ],
+)
+def test_an_aov_that_is_not_there_or_is_an_id(
+    command: str, words: list[str], said: str, weights: Path, source: Path, tmp_path: Path
+) -> None:
+    run = in_process(command, source, tmp_path / "out.exr", "--model", weights, *words)
+    assert run.code == 3
+    assert said in run.err
+    assert not list(tmp_path.iterdir())
