@@ -29,6 +29,11 @@ from pipelines.options import COMPRESSIONS
     is_flag=True,
     help="Flat forms: what each layer adds to the beauty, to be summed, not composited by over.",
 )
+@option(
+    "--samples",
+    is_flag=True,
+    help="Instead of layers, copy the samples of IN with each one's share in every layer: layer0.weight ...",
+)
 @job_options
 @option(
     "--compression",

@@ -184,19 +184,22 @@ class Job:
                 return DenoisedFrame(None, plan)
             tell_repairs(frame.source, plan.survey.repairs, progress)
             surveyed = time.perf_counter()
-            layers = denoise_bands(
-                reader, self.net, plan.shot.scale, plan.roles, plan.shot.layers, plan.bands,
-                lambda done: progress.update(SURVEY_SHARE + (1 - SURVEY_SHARE) * done),
-            )
-            header = reader.header
-        network = time.perf_counter()
-        clamped = self.write(frame, targets, plan, layers, header)
+            clamped, network = self.produce(frame, targets, plan, reader, lambda done: progress.update(
+                SURVEY_SHARE + (1 - SURVEY_SHARE) * done))
         if clamped:
             progress.note(f"{frame.target}: {clamped} values beyond half's range were clamped; "
                           f"--pixel-type float keeps them")
-        seconds = {"survey": surveyed - begun, "network": network - surveyed,
-                   "write": time.perf_counter() - network}
+        seconds = {"survey": surveyed - begun, "network": network,
+                   "write": time.perf_counter() - surveyed - network}
         return DenoisedFrame(frame.target, plan, clamped, seconds)
+
+    def produce(self, frame: sequences.Frame, wanted: list[Path], plan: FramePlan, reader: SampleReader,
+                update: Callable[[float], None]) -> tuple[int, float]:
+        """Denoises a frame and writes the files wanted; returns values clamped to half and the network's seconds."""
+        begun = time.perf_counter()
+        layers = denoise_bands(reader, self.net, plan.shot.scale, plan.roles, plan.shot.layers, plan.bands, update)
+        network = time.perf_counter() - begun
+        return self.write(frame, wanted, plan, layers, reader.header), network
 
     def targets(self, frame: sequences.Frame) -> list[Path]:
         """The files that a frame becomes."""

@@ -27,6 +27,7 @@ from deep_io.sequences import Frame
 from deep_io.weighting import ATTRIBUTE as WEIGHTING_ATTRIBUTE
 from pipelines.denoise import DenoisedFrame, FramePlan, Job, run_job, to_pixel_type
 from pipelines.export_options import ExportOptions
+from pipelines.export_samples import SamplesJob
 from pipelines.inference import FrameLayers
 from pipelines.jobs import JobReport
 from pipelines.progress import Progress
@@ -149,7 +150,7 @@ def export_frames(options: ExportOptions) -> JobReport[DenoisedFrame]:
 
     Raises InputError or UsageError for what concerns the whole job, before any frame is touched.
     """
-    return run_job(ExportJob, options)
+    return run_job(SamplesJob if options.samples else ExportJob, options)
 
 
 def encode_rows(layers: FrameLayers, rows: slice, dtype: npt.DTypeLike, by_depth: bool) -> OverLayers:

@@ -22,6 +22,8 @@ class ExportOptions(DenoiseOptions):
     form: Form = "deep"
     """`deep`: a sample per layer; `parts`: a part per layer after the beauty; `channels`: layer0.R ... beside the
     beauty's R, G, B, A in one part; `files`: a file per layer, OUT.layer0.####.exr."""
+    samples: bool = False
+    """Write the input's samples with their share in each layer, not the layers."""
     contributions: bool = False
     """Flat forms only: what each layer adds to the beauty, for a plain sum, in place of over form."""
 
@@ -31,6 +33,9 @@ class ExportOptions(DenoiseOptions):
             raise ValueError(f"form must be one of {', '.join(FORMS)}, not {self.form}")
         if not self.target.lower().endswith(".exr"):
             raise ValueError(f"{self.target}: --form {self.form} writes OpenEXR; give OUT the extension .exr")
+        if self.samples and (self.form != "deep" or self.contributions or self.aovs or self.ids):
+            raise ValueError("--samples copies the input's own samples: it goes without --form, --contributions, --aov "
+                             "and --ids")
         if self.form == "deep" and self.contributions:
             raise ValueError("contributions are summed, but deep samples are composited by over; choose --form parts, "
                              "channels or files for them")
