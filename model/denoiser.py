@@ -238,7 +238,7 @@ class Denoiser(nn.Module):
             # the embedding has done its work
             planes.append(torch.cat([part[..., :GUIDED_COLUMNS], part[..., end:]], -1))
         splats, predicted = (_picture(parts, samples.shape).flatten(0, 1) for parts in (planes, predictions))
-        means = filter_guided(splats, predicted, self.guide_matrix, self.config, samples.lights)
+        means = filter_guided(splats, predicted, self.guide_matrix, self.config, scale, samples.lights)
         return composite(means.view(samples.shape[0], len(keep), *means.shape[1:]))
 
     def _filter_direct(self, samples: Samples, embedding: Tensor, relative: Tensor | None, contexts: list[Tensor],

@@ -1,7 +1,8 @@
 """The affinity kernels' stage: what is splatted besides radiance, how kernels are predicted, the demodulated path.
 
-Features for the affinity are predicted per layer and pixel; guides (normal, log depth, divisor) are added to them with
-a learned matrix, so that the kernel is a joint bilateral filter before any training. `affinity.py` has the filter.
+Features for the affinity are predicted per layer and pixel; guides (normal, log depth, divisor, glare) are added to
+them with a learned matrix, so that the kernel is a joint bilateral filter before any training. `affinity.py` has the
+filter.
 """
 
 from __future__ import annotations
@@ -11,15 +12,18 @@ from torch import Tensor, nn
 
 from model.affinity import affinity_filter
 from model.config import DIVISOR_WINDOW, Config
-from model.features import FrameScale, divisor, log_depth
+from model.features import FrameScale, divisor, log_depth, log_radiance
 from model.networks import Mlp
 from model.partition import BASIC_COLUMNS, FILTERED, hit_depth, share_of
 from model.samples import Samples
 
-GUIDE_SCALES = (2.0, 2.0, 2.0, 3.0, 1.5, 1.5, 1.5)  # normal, log depth, divisor: the joint bilateral filter at step 0
+# Normal, log depth, divisor, glare: the joint bilateral filter at step 0.
+GUIDE_SCALES = (2.0, 2.0, 2.0, 3.0, 1.5, 1.5, 1.5, 1.0)
+GLARE_START = 3.0  # log(1 + exposure L): radiance about 20 times the frame's middle
 DIVISOR_GUIDE_SCALE = 6.0  # the divisor's own, sharper kernel
 
 # Columns of a splat: log n, log w, then per unit of occupancy those of `basic_values`, of `guide_values`, embedding.
+RADIANCE = slice(2, 5)
 REDUCED = slice(BASIC_COLUMNS, 10)  # demodulated radiance
 GUIDES = slice(10, 17)  # normal, log depth, divisor
 GUIDED_COLUMNS = 17
@@ -34,6 +38,15 @@ def guide_values(samples: Samples, scale: FrameScale) -> Tensor:
         normal = torch.where(hit, samples.roles["normal"], normal)
     by = divisor(samples)
     return torch.cat([radiance / by, normal, log_depth(depth, scale.depth), by], 1)
+
+
+def glare(radiance: Tensor, exposure: float) -> Tensor:
+    """Radiance (B, 3, H, W) -> (B, 1, H, W): log units beyond GLARE_START, else 0.
+
+    As a guide it keeps lamps, a thousand times their surroundings, from leaking out of their edges; radiance below
+    is no guide, since its differences are mostly noise.
+    """
+    return (log_radiance(radiance.amax(1, keepdim=True), exposure) - GLARE_START).clamp_min(0)
 
 
 def demodulated_lights(samples: Samples) -> list[Tensor]:
@@ -74,8 +87,8 @@ def predict(generator: Mlp, layer_bias: Tensor, planes: Tensor, context: Tensor)
     return generator.rest(shared + mine + layer_bias).to(planes.dtype)
 
 
-def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Parameter, config: Config, lights: int
-                  ) -> Tensor:
+def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Parameter, config: Config, scale: FrameScale,
+                  lights: int) -> Tensor:
     """Filters each layer by affinity, radiance along two paths if `config.demodulation`.
 
     planes (B*L, K, H, W): GUIDED_COLUMNS, extra values and, with demodulation, the first `lights` of them demodulated;
@@ -86,7 +99,7 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
     share = share_of(log_n, log_w)[:, None]
     own = torch.where(share > 0, share, 1)  # values per unit of the layer's own weight: divide by this
     features, bias, preference, gate, *divided = torch.split(predictions, list(generator_sizes(config)), 1)
-    guides = planes[:, GUIDES] / own
+    guides = torch.cat([planes[:, GUIDES] / own, glare(planes[:, RADIANCE] / own, scale.exposure)], 1)
     features = features + torch.einsum("bghw,fg->bfhw", guides, guide_matrix) * (2 * torch.sigmoid(gate))
     reduced_too = [planes[:, REDUCED]] if config.demodulation else []
     values = torch.cat([planes[:, FILTERED], share, *reduced_too, planes[:, GUIDED_COLUMNS:]], 1)
@@ -95,7 +108,7 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
         return out
     plain, others, reduced, extra = torch.split(out, [3, 3, 3, out.shape[1] - 9], 1)
     mix, divisor_gate, divisor_bias = divided
-    by = guides[:, 4:]
+    by = guides[:, 4:7]
     sharp = by * (DIVISOR_GUIDE_SCALE * torch.sigmoid(divisor_gate))
     factor = affinity_filter(sharp, divisor_bias, torch.zeros_like(divisor_bias), log_w, by, (DIVISOR_WINDOW,))
     # no own weight near the target: nothing to multiply by, the plain path stands

@@ -18,6 +18,8 @@ from model.samples import Samples, Segments
 PRIOR_WINDOW = 9  # pixels; the neighbourhood that depth is compared with
 OUTLIER_WINDOWS = (3, 9)  # pixels; the neighbourhoods that a sample's radiance is compared with
 OWN_SHARE = 0.5
+RARE = 4.0  # log units above the mean radiance around: seen in less than about 2 % of the samples
+RADIANCE_LIMIT = 1e18  # in exposure units; sums over a window of such radiance are finite in float32
 OUTLIER_START = 4.0  # log units above the surroundings from which a sample's confidence falls by itself
 PRIOR_SPREAD = 0.1  # log units: depth differences well under this are one surface
 PRIOR_LIMIT = 4.0  # standard deviations
@@ -131,22 +133,29 @@ def splat(log_weight: Tensor, log_partition: Tensor, values: Tensor, segments: S
 
 
 def outlierness(samples: Samples, segments: Segments, scale: FrameScale) -> Tensor:
-    """(N, 1): how far above its surroundings a sample is, in log radiance; about 0 for one that agrees with them.
+    """(N, 1): how far above its surroundings a sample is, in log radiance, as far as it is also rare there.
 
-    log(1 + exposure L) less the largest of: its mean over each of OUTLIER_WINDOWS pixels around, and OWN_SHARE of its
-    mean over the sample's own pixel. A lone bright sample is far above all of them, also where its pixel has no other;
-    a small lamp, bright in all samples of its pixels, is not.
+    With b = log(1 + exposure L) it is the smaller of two: b less the largest of its mean over each of OUTLIER_WINDOWS
+    pixels around and OWN_SHARE of its mean over the sample's own pixel; and r + (r - RARE), r being b less the log of
+    the mean radiance around, which is about -log(share of the samples that are so bright). A lone bright sample is far
+    above all of them, also where its pixel has no other; a small lamp, bright in all samples of its pixels, is not,
+    and neither is a lamp out of focus that many pixels around see.
     """
     batch, height, width = samples.shape
-    brightness = log_radiance(samples.roles["radiance"].amax(1, keepdim=True), scale.exposure)
+    radiance = samples.roles["radiance"].amax(1, keepdim=True)
+    brightness = log_radiance(radiance, scale.exposure)
     weight = samples.weight[:, None]
-    sums = segments.sum(torch.cat([weight, weight * brightness], 1))  # (P, 2)
-    picture = sums.view(batch, height, width, 2).permute(0, 3, 1, 2)
+    exposed = (radiance * scale.exposure).clamp(0, RADIANCE_LIMIT)
+    sums = segments.sum(weight * torch.cat([torch.ones_like(weight), brightness, exposed], 1))  # (P, 3)
+    picture = sums.view(batch, height, width, 3).permute(0, 3, 1, 2)
     around = OWN_SHARE * sums[:, 1]
     for window in OUTLIER_WINDOWS:
-        blurred = F.avg_pool2d(picture, window, 1, window // 2).permute(0, 2, 3, 1).reshape(-1, 2)
-        around = torch.maximum(around, blurred[:, 1] / torch.where(blurred[:, 0] > 0, blurred[:, 0], 1))
-    return brightness - segments.expand(around[:, None])
+        blurred = F.avg_pool2d(picture, window, 1, window // 2).permute(0, 2, 3, 1).reshape(-1, 3)
+        means = blurred[:, 1:] / torch.where(blurred[:, :1] > 0, blurred[:, :1], 1)
+        around = torch.maximum(around, means[:, 0])
+    surroundings = segments.expand(torch.stack([around, torch.log1p(means[:, 1])], 1))  # the widest window's mean
+    above, rarity = (brightness - surroundings).split(1, 1)
+    return torch.minimum(above, 2 * rarity - RARE)
 
 
 def initial_logits(relative: Tensor | None, strength: Tensor, keep: Sequence[int], logits: int) -> Tensor | float:
