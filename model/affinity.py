@@ -3,9 +3,9 @@
 At level i a target pixel sees a small window of cells of 2^i x 2^i pixels. With f the features, u the sources' bias
 and v the targets' preference for a level, the logit of cell s for target t is
 
-    logit = u_s + v_t + log n_s + log B(t - s) - |f_t - f_s|^2
+    logit = u_s + v_t + log n_s + log B(t - s) - E|f_t - f_s|^2
 
-where B is the quadratic B-spline over three cells (nothing for level 0), so that no cell boundary shows, and n_s the
+where the mean is over the pixels of the cell, so that a cell that straddles an edge is far from both sides, B is the quadratic B-spline over three cells (nothing for level 0), so that no cell boundary shows, and n_s the
 occupancy. One normalisation per target over all taps of all levels: out_t = sum_s softmax(logit)_s value_s.
 Targets keep their full resolution at every level, so coarse levels respect edges too.
 """
@@ -222,12 +222,12 @@ def affinity_filter(
         log_n = F.pad(log_n, pad, value=-torch.inf)
     cells: list[Tensor] = []
     sizes = [2**number for number in range(len(windows))]
-    planes = torch.cat([features, values], 1)
+    planes = torch.cat([features, values, features.square().sum(1, keepdim=True)], 1)
     for number, cell in enumerate(sizes):
         biased = log_n + source_bias[:, number]
         bias, means = pool_cells(biased, planes, cell)
-        feature, value = torch.split(means, [features.shape[1], values.shape[1]], 1)
-        cells += [bias - feature.square().sum(1), feature, value]
+        feature, value, norm = torch.split(means, [features.shape[1], values.shape[1], 1], 1)
+        cells += [bias - norm[:, 0], feature, value]
     if torch.is_grad_enabled():
         apply: Callable[..., Tensor] = _AffinityFilter.apply
         return apply(features, target_preference, sizes, tuple(windows), *cells)[..., :height, :width]

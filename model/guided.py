@@ -18,7 +18,7 @@ from model.partition import BASIC_COLUMNS, FILTERED, hit_depth, share_of
 from model.samples import Samples
 
 # Normal, log depth, divisor, glare: the joint bilateral filter at step 0.
-GUIDE_SCALES = (2.0, 2.0, 2.0, 3.0, 1.5, 1.5, 1.5, 1.0)
+GUIDE_SCALES = (2.0, 2.0, 2.0, 3.0, 1.5, 1.5, 1.5, 2.0)
 GLARE_START = 3.0  # log(1 + exposure L): radiance about 20 times the frame's middle
 DIVISOR_GUIDE_SCALE = 6.0  # the divisor's own, sharper kernel
 

@@ -38,13 +38,13 @@ def oracle(features: Tensor, bias: Tensor, preference: Tensor, log_n: Tensor, va
                         if logs.numel() == 0 or bool((logs == -math.inf).all()):
                             continue
                         share = torch.softmax(logs, 0)
-                        feature = (features[:, rows, cols].flatten(1) * share).sum(1)
                         value = (values[:, rows, cols].flatten(1) * share).sum(1)
                         spline = 1.0
                         if level > 0 and window > 1:
                             spline = (b_spline((ty + 0.5) / size - cy - 0.5) * b_spline((tx + 0.5) / size - cx - 0.5))
                         mean_occupancy = torch.logsumexp(logs, 0) - math.log(size * size)
-                        distance = (features[:, ty, tx] - feature).square().sum()
+                        apart = features[:, ty, tx, None] - features[:, rows, cols].flatten(1)
+                        distance = (apart.square().sum(0) * share).sum()
                         scores.append(preference[level, ty, tx] + mean_occupancy + math.log(spline) - distance)
                         found.append(value)
             if scores:
