@@ -26,7 +26,8 @@ class Survey:
     depth : median over the pixels of their hits' mean depth, scene units; 1 without depth or hits
     varying : roles whose values differ anywhere among the hits; the others are constant over the whole frame
     pixels, empty_pixels, samples, hits : counts
-    mixed : share of the pixels in which depth mixes: hits further apart than MIXED_DEPTH, or hits and misses
+    mixed : share of the pixels in which depth mixes: hits further apart than MIXED_DEPTH, or hits and misses; None
+        without depth
     luminance : mean over pixels of the samples' mean radiance
     repairs : non-finite values that were mended, by role
     """
@@ -38,7 +39,7 @@ class Survey:
     empty_pixels: int
     samples: int
     hits: int
-    mixed: float
+    mixed: float | None
     luminance: float
     repairs: dict[str, int]
 
@@ -83,7 +84,7 @@ def survey(blocks: Iterable[PathSamples]) -> Survey:
         empty_pixels=empty,
         samples=samples,
         hits=hits,
-        mixed=mixed / max(pixels, 1),
+        mixed=mixed / max(pixels, 1) if depths else None,
         luminance=total / max(pixels, 1),
         repairs=dict(repairs),
     )
