@@ -24,6 +24,7 @@ COMMANDS = {
     "info": "Show what a deep sample file holds and how it would be read.",
     "pack": "Pack one-sample flat renders into one deep sample file.",
     "compare": "Measure an image against its reference.",
+    "bench": "Measure speed against error on a folder of scenes, beside other denoisers.",
     "render": "Render training scenes with Mitsuba: deep samples and references.",
     "train": "Train a network on deep sample files with references.",
     "models": "List the weights that are here.",

@@ -1,0 +1,61 @@
+"""`lbmc bench`: speed against error on a folder of scenes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lbmc_cli.options import PROGRESS, LbmcCommand, option
+
+
+@click.command(cls=LbmcCommand)
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default="bench",
+    show_default=True,
+    metavar="FOLDER",
+    help="Where results.json, results.md and report.html go; made if need be.",
+)
+@option(
+    "--model",
+    "models",
+    multiple=True,
+    metavar="PRESET|FILE",
+    help="Preset or .safetensors file to measure. Repeatable.  [default: the presets that ship]",
+)
+@option("--match", default="*", show_default=True, metavar="GLOB", help="Only scenes whose NAME matches.")
+@option("--threads", type=click.IntRange(1), default=1, show_default=True, metavar="N", help="CPU threads.")
+@option("--repeats", type=click.IntRange(1), default=3, show_default=True, help="Timed runs of each method and scene.")
+@option("--no-paper", is_flag=True, help="Leave the paper's networks out (they have no weights, only a time).")
+@option("--no-curves", is_flag=True, help="Leave the error at fewer samples per pixel out.")
+@option("--no-savings", is_flag=True, help="Leave lbmc in other configurations out.")
+@option("--no-memory", is_flag=True, help="Leave peak memory out, for which each method runs in a new process.")
+@option("--no-flip", is_flag=True, help="Leave FLIP out, the slowest metric.")
+@option("--overwrite", is_flag=True, help="Replace results that exist.")
+@PROGRESS
+def bench(
+    no_paper: bool, no_curves: bool, no_savings: bool, no_memory: bool, no_flip: bool, **choices: Any
+) -> None:
+    """Measure speed against error on DIR, a folder of NAME.deep.exr and NAME.ref.exr.
+
+    lbmc, untrained filters, Intel OIDN where pyoidn is installed, and the paper's networks (random weights, so their
+    time only) run on every scene. report.html is one page with charts, tables and all images; it needs no network.
+    """
+    from pipelines.bench.job import REPORT, TABLE, BenchOptions
+    from pipelines.bench.job import bench as run
+
+    options = BenchOptions(
+        paper=not no_paper,
+        curves=not no_curves,
+        savings=not no_savings,
+        memory=not no_memory,
+        flip=not no_flip,
+        **choices,
+    )
+    run(options)
+    click.echo((options.out / TABLE).read_text("utf-8"))
+    click.echo(f"report: {options.out / REPORT}", err=True)

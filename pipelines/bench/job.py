@@ -1,0 +1,238 @@
+"""The protocol of a bench: what runs in which order, what is kept, and the three files that come out.
+
+Every method runs once on every scene to warm up and to be scored; then all methods take turns, `repeats` times, and
+the medians of their times count. Errors are those of the files written, in half precision.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+
+from deep_io.atomic import atomic_output, output_action
+from deep_io.errors import InputError
+from model import zoo
+from model.denoiser import Denoiser
+from model.metrics import common_scale, relmse, score, smape
+from pipelines.bench.clock import Times
+from pipelines.bench.growth import SAMPLES, SIDE, growth
+from pipelines.bench.memory import measurable, peak_memory
+from pipelines.bench.methods import PAPER, LbmcMethod, Method, MethodSpec, make, method_specs, oidn_installed
+from pipelines.bench.report import Gallery, html_report
+from pipelines.bench.results import CurvePoint, Measurement, Results, SceneInfo, machine
+from pipelines.bench.scenes import Scene, find_scenes, write_thinned
+from pipelines.bench.tables import markdown_report
+from pipelines.compare import read_rgb
+from pipelines.progress import Progress, ProgressKind, make_progress
+
+Item = TypeVar("Item")
+
+RESULTS, TABLE, REPORT = "results.json", "results.md", "report.html"
+GROWN = ("LAYER", "SAMPLESPLAT")
+"""Of the paper's networks, those whose time is measured from 4 to 64 samples."""
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """What a bench is told.
+
+    models : presets or weight files; none: the presets that ship
+    match : only scenes whose name matches this glob
+    paper : also time the paper's networks, which have random weights and no error
+    curves : also thin the scenes to 1, 2, 4, ... samples per pixel
+    savings : also lbmc otherwise configured, to see what each saving saves and costs
+    memory : also peak memory, each method in a process of its own
+    growth : samples per pixel at which the cost of networks is counted and timed; none: leave that out
+    """
+
+    folder: Path
+    out: Path
+    models: tuple[str, ...] = ()
+    match: str = "*"
+    threads: int = 1
+    repeats: int = 3
+    paper: bool = True
+    curves: bool = True
+    savings: bool = True
+    memory: bool = True
+    growth: tuple[int, ...] = SAMPLES
+    flip: bool = True
+    overwrite: bool = False
+    progress: ProgressKind = "auto"
+
+
+def bench(options: BenchOptions) -> Results:
+    """Measures, and writes results.json, results.md and report.html into `options.out`, which is made if need be.
+
+    Raises InputError for what is wrong with the folder or a scene (`find_scenes`), UsageError for outputs that exist
+    and for models that do not.
+    """
+    scenes = find_scenes(options.folder, options.match)
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{options.out}: cannot be made a folder ({error.strerror})") from error
+    targets = [options.out / name for name in (RESULTS, TABLE, REPORT)]
+    for target in targets:
+        output_action(target, [scene.source for scene in scenes], "overwrite" if options.overwrite else "refuse")
+    with tempfile.TemporaryDirectory(prefix="lbmc-bench-") as folder, Bench(options, scenes, Path(folder)) as run:
+        results, gallery = run.measure()
+    texts = (json.dumps(_plain(results.to_dict()), indent=1, ensure_ascii=False) + "\n", markdown_report(results),
+             html_report(results, gallery))
+    for target, text in zip(targets, texts, strict=True):
+        with atomic_output(target) as path:
+            path.write_text(text, "utf-8")
+    return results
+
+
+class Bench:
+    """One run: the methods made ready, and their results as they come."""
+
+    def __init__(self, options: BenchOptions, scenes: list[Scene], folder: Path) -> None:
+        self.options = options
+        self.scenes = scenes
+        self.folder = folder
+        self.target = folder / "result.exr"
+        torch.set_num_threads(options.threads)
+        models = options.models or tuple(zoo.presets())
+        self.specs = method_specs(models, oidn_installed(), options.paper, options.savings)
+        self.methods: dict[str, Method] = {}
+        with ExitStack() as stack:
+            for spec in self.specs:
+                method = make(spec, options.threads, folder)
+                self.methods[spec.name] = method
+                stack.callback(method.close)
+            self._open = stack.pop_all()
+        infos = [SceneInfo(scene.name, scene.width, scene.height, scene.samples) for scene in scenes]
+        protocol = {
+            "repeats": options.repeats, "warm_up": 1, "interleaved": True, "statistic": "median",
+            "oidn": oidn_installed(), "growth_pixels": SIDE * SIDE,
+        }
+        self.results = Results(machine(options.threads), protocol, self.specs, infos)
+        # One scene stands for all where each run is dear: the first of the largest group.
+        self.example = next(s for s in scenes if s.samples == self.results.groups()[0])
+        self.results.protocol["example"] = self.example.name
+        self.gallery = Gallery()
+
+    def __enter__(self) -> Bench:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    def measure(self) -> tuple[Results, Gallery]:
+        """Everything, in order."""
+        options = self.options
+        curves = [(scene, most) for scene in self.scenes for most in scene.thinned_counts()] if options.curves else []
+        steps = len(self.scenes) * (1 + options.repeats) + len(curves) + len(options.growth)
+        with_memory = options.memory and measurable()
+        steps += len(self.specs) if with_memory else 0
+        with make_progress(options.progress, steps) as progress:
+            scores = {scene.name: dict(self._score(scene)) for scene in _steps(self.scenes, progress, "errors of")}
+            self._time(scores, progress)
+            for scene, most in curves:
+                progress.begin(f"{scene.name} with {most} samples")
+                self._curve(scene, most)
+                progress.finish()
+            self._grow(progress)
+            if with_memory:
+                for spec in _steps(self.specs, progress, "memory of"):
+                    self.results.memory[spec.name] = peak_memory(
+                        spec, self.example.source, options.threads, self.folder)
+        return self.results, self.gallery
+
+    def _run(self, spec: MethodSpec, source: Path) -> Times:
+        method = self.methods[spec.name]
+        method.run(source, self.target)
+        return method.clock.take()
+
+    def _score(self, scene: Scene) -> Iterator[tuple[str, dict[str, float | None]]]:
+        """Errors of all methods on a scene; this also warms them up."""
+        reference = scene.reference.rgb
+        self.gallery.add(scene.name, "reference", reference, reference)
+        for spec in self._on(scene):
+            self._run(spec, scene.source)
+            if not spec.scored:
+                continue
+            picture = read_rgb(self.target).rgb
+            yield spec.name, asdict(score(picture, reference, with_flip=self.options.flip))
+            if spec.family != "saving":
+                self.gallery.add(scene.name, spec.name, picture, reference)
+
+    def _on(self, scene: Scene) -> list[MethodSpec]:
+        """The methods that run on a scene: all on the example, those that have an error on the others."""
+        return [spec for spec in self.specs if spec.scored or scene is self.example]
+
+    def _time(self, scores: dict[str, dict[str, dict[str, float | None]]], progress: Progress) -> None:
+        runs: dict[tuple[str, str], list[Times]] = {}
+        for _ in range(self.options.repeats):
+            for scene in _steps(self.scenes, progress, "times of"):
+                for spec in self._on(scene):
+                    runs.setdefault((scene.name, spec.name), []).append(self._run(spec, scene.source))
+        for (scene_name, name), times in runs.items():
+            self.results.measurements.append(Measurement(
+                scene_name, name, scores[scene_name].get(name),
+                _median([run.cpu for run in times]), _median([run.wall for run in times]),
+            ))
+
+    def _curve(self, scene: Scene, most: int) -> None:
+        thinned = self.folder / "thinned.deep.exr"
+        write_thinned(scene, most, thinned)
+        k = common_scale(scene.reference.rgb)
+        reference = k * scene.reference.rgb.astype("f8")
+        for spec in self.specs:
+            if spec.scored and spec.family != "saving":
+                self._run(spec, thinned)
+                picture = k * read_rgb(self.target).rgb.astype("f8")
+                self.results.curve.append(CurvePoint(
+                    scene.name, spec.name, most, relmse(picture, reference), smape(picture, reference)))
+
+    def _grow(self, progress: Progress) -> None:
+        counted = dict(PAPER)
+        timed = {}
+        if self.options.paper:
+            torch.manual_seed(0)
+            timed = {name: Denoiser(PAPER[name]).eval() for name in GROWN}
+        for spec in self.specs:
+            method = self.methods[spec.name]
+            if spec.family == "lbmc" and isinstance(method, LbmcMethod):
+                counted[spec.name] = method.job.net.config
+                timed[spec.name] = method.job.net
+        for per_pixel in self.options.growth:
+            progress.begin(f"networks at {per_pixel} samples")
+            self.results.growth += growth(counted, timed, [per_pixel], repeats=self.options.repeats)
+            progress.finish()
+        for spec in self.specs:
+            self.methods[spec.name].clock.take()  # the watched networks ran outside of any measurement
+
+
+def _steps(items: Iterable[Item], progress: Progress, verb: str) -> Iterator[Item]:
+    """The items, each a step of the progress."""
+    for item in items:
+        progress.begin(f"{verb} {getattr(item, 'name', item)}")
+        yield item
+        progress.finish()
+
+
+def _median(runs: list[dict[str, float]]) -> dict[str, float]:
+    """Stage by stage; a stage that some run did not reach took no time there."""
+    stages = dict.fromkeys(stage for run in runs for stage in run)
+    return {stage: statistics.median(run.get(stage, 0.0) for run in runs) for stage in stages}
+
+
+def _plain(value: Any) -> Any:
+    """JSON knows no infinity and no NaN: they become null."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value if not isinstance(value, float) or math.isfinite(value) else None

@@ -1,0 +1,114 @@
+"""The scenes of a bench: deep sample files with references, checked before any time is spent, and thinned copies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from pathlib import Path
+
+import numpy as np
+
+from deep_io import DeepSamples, read_deep, write_deep
+from deep_io.errors import InputError
+from deep_io.path_samples import SampleReader
+from model.metrics import common_scale
+from pipelines.compare import FlatPicture, read_rgb
+
+DEEP, REFERENCE = ".deep.exr", ".ref.exr"
+SEED = 20100623
+"""Of the order in which samples are left out, the same in every run."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One deep sample file and its reference.
+
+    samples : per pixel, on average, rounded
+    """
+
+    name: str
+    source: Path
+    reference: FlatPicture
+    samples: int
+    weighting: str
+
+    @property
+    def width(self) -> int:
+        return self.reference.window.width
+
+    @property
+    def height(self) -> int:
+        return self.reference.window.height
+
+    @property
+    def megapixels(self) -> float:
+        return self.width * self.height / 1e6
+
+    def thinned_counts(self) -> list[int]:
+        """1, 2, 4, ... below the file's own samples per pixel; none where samples are not simply averaged."""
+        if self.weighting != "uniform":
+            return []
+        return [2**k for k in range(self.samples.bit_length()) if 2**k < self.samples]
+
+
+def find_scenes(folder: Path, match: str = "*") -> list[Scene]:
+    """Every NAME.deep.exr of `folder` that has a NAME.ref.exr, and whose NAME matches the glob, by name.
+
+    Raises InputError when there is no such folder or no such pair, and what `open_scene` raises.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
+    deep = {path.name.removesuffix(DEEP) for path in folder.glob(f"*{DEEP}")}
+    references = {path.name.removesuffix(REFERENCE) for path in folder.glob(f"*{REFERENCE}")}
+    names = [name for name in sorted(deep & references) if fnmatch(name, match)]
+    if not names:
+        raise InputError(
+            f"{folder}: no name in common between {len(deep)} files NAME{DEEP} and {len(references)} NAME{REFERENCE} "
+            f"that matches {match!r}; a scene is such a pair"
+        )
+    return [open_scene(folder / f"{name}{DEEP}", folder / f"{name}{REFERENCE}") for name in names]
+
+
+def open_scene(source: Path, reference: Path) -> Scene:
+    """One pair, checked. Raises InputError for files that cannot be read, windows that differ (both are named), a
+    reference without light or with values that are not finite.
+    """
+    picture = read_rgb(reference)
+    with SampleReader(source) as reader:
+        window = reader.header.data_window
+        if window != picture.window:
+            raise InputError(
+                f"{source} is {window.width} x {window.height} at ({window.xmin}, {window.ymin}), but {reference} is "
+                f"{picture.window.width} x {picture.window.height} at ({picture.window.xmin}, {picture.window.ymin})"
+            )
+        samples = max(round(reader.total / (window.width * window.height)), 1)
+        weighting = reader.weighting
+    bad = int(np.count_nonzero(~np.isfinite(picture.rgb).all(axis=-1)))
+    if bad:
+        raise InputError(f"{reference}: {bad} pixels are not finite, so no error can be measured")
+    try:
+        common_scale(picture.rgb)
+    except ValueError as error:
+        raise InputError(f"{reference}: {error}") from error
+    return Scene(source.name.removesuffix(DEEP), source, picture, samples, weighting)
+
+
+def thin(samples: DeepSamples, most: int, seed: int = SEED) -> DeepSamples:
+    """At most `most` samples of every pixel, drawn without replacement, in stored order.
+
+    Each pixel draws for itself, since a renderer's sample number and its shutter time go together. With one seed the
+    draws are nested: what is kept for 2 is among what is kept for 4.
+    """
+    pixel = samples.pixel_index
+    order = np.lexsort((np.random.default_rng(seed).random(samples.total), pixel))
+    rank = np.empty(samples.total, np.int64)
+    rank[order] = np.arange(samples.total) - samples.offsets[pixel]
+    kept = rank < most
+    channels = {name: values[kept] for name, values in samples.channels.items()}
+    return DeepSamples(np.minimum(samples.counts, most).astype(np.int32), channels, samples.window)
+
+
+def write_thinned(scene: Scene, most: int, target: Path) -> None:
+    """Writes the scene with at most `most` samples in every pixel, its header otherwise as it was."""
+    samples, header = read_deep(scene.source)
+    write_deep(target, thin(samples, most), header)

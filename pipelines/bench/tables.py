@@ -1,0 +1,189 @@
+"""The tables of a bench, as rows of text: Markdown for results.md, and the same rows for the page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pipelines.bench.charts import number
+from pipelines.bench.methods import FAMILIES, OUTSIDE, STAGES
+from pipelines.bench.results import Results, Summary, pareto
+
+FULL_HD = 1920 * 1080 / 1e6
+"""Megapixels of the frame that times per megapixel are scaled to for a reader."""
+
+INSTALL_OIDN = "OIDN is left out: pyoidn is not installed; pip install 'lbmc[bench]' brings it."
+PUBLISHED = {
+    "PIXELGATHER": (0.0352, 0.0353),
+    "SAMPLESPLAT": (0.0298, 0.0344),
+    "LAYER": (0.0288, 0.0350),
+    "LAYER_w": (0.0295, 0.0350),
+    "OPTIMIZED": (0.0351, 0.0361),
+}
+"""relMSE and SMAPE as published (Munkberg and Hasselgren 2020): 36 images of theirs at 8 samples per pixel."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with a title; the first column is a name, the others are numbers."""
+
+    title: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+
+    def markdown(self) -> str:
+        """A Markdown section."""
+        lines = ["| " + " | ".join(self.head) + " |", "|---" + "|---:" * (len(self.head) - 1) + "|"]
+        lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in self.rows]
+        note = f"\n\n{self.note}" if self.note else ""
+        return f"## {self.title}\n\n" + "\n".join(lines) + note + "\n"
+
+
+def all_tables(results: Results) -> list[Table]:
+    """Every table that the results fill, in the order of the page."""
+    tables = [methods_table(results, samples) for samples in results.groups()]
+    tables.append(stages_table(results, results.groups()[0]))
+    tables += [table for table in (savings_table(results), growth_table(results), published_table(results))
+               if table.rows]
+    return tables
+
+
+def methods_table(results: Results, samples: int) -> Table:
+    """Errors, times and memory of every method over the scenes of a group; a star on the Pareto front."""
+    summary = results.summary(samples)
+    front = pareto(front_points(results, samples))
+    rows = []
+    for spec in results.methods:
+        if spec.name not in summary or spec.family == "saving":
+            continue
+        row = summary[spec.name]
+        time = ["–", "–"] if spec.family == "input" else [number(row.own_cpu * FULL_HD), number(row.own_wall * FULL_HD)]
+        memory = results.memory.get(spec.name)
+        rows.append([spec.name + (" ★" if spec.name in front else ""), *_errors(row), *time,
+                     "–" if memory is None else f"{memory / 2**20:.0f}"])
+    count = len(results.scenes_of(samples))
+    note = "relMSE is the geometric mean over the scenes with its 95 % bootstrap interval, the other errors are means. "
+    note += (f"Times are of the method's own work (all but {', '.join(OUTSIDE)}), scaled by pixels to 1920 x 1080. "
+             "★ is on the Pareto front of CPU time and relMSE. Untrained networks have random weights, so they have a "
+             "time but no error.")
+    errors = ("relMSE", "interval", "trimmed", "SMAPE", "PSNR", "SSIM", "FLIP", "energy")
+    head = ("method", *errors, "CPU s", "wall s", "MiB")
+    return Table(f"{count} scene{'s' if count != 1 else ''} with {samples} samples per pixel", head, rows, note)
+
+
+def front_points(results: Results, samples: int) -> dict[str, tuple[float, float]]:
+    """(CPU seconds per megapixel, relMSE) of the methods that compete: those with an error that do something."""
+    summary = results.summary(samples)
+    points = {}
+    for spec in results.methods:
+        error = summary[spec.name].scores.get("relmse") if spec.name in summary else None
+        if error is not None and spec.family not in ("input", "saving"):
+            points[spec.name] = (summary[spec.name].own_cpu, error)
+    return points
+
+
+def stages_table(results: Results, samples: int) -> Table:
+    """CPU milliseconds per megapixel by stage, as in the paper's Table 3."""
+    summary = results.summary(samples)
+    stages = [stage for stage in STAGES if any(row.cpu.get(stage, 0.0) > 0.0 for row in summary.values())]
+    rows = [
+        [name, *(number(1e3 * row.cpu[stage]) if stage in row.cpu else "–" for stage in stages),
+         number(1e3 * sum(row.cpu.values()))]
+        for name, row in summary.items()
+    ]
+    note = ("CPU milliseconds per megapixel, medians. Methods that are no network have their whole work under "
+            f"{STAGES['filter']!r}. Flattening stands for what a renderer would have handed over, so it counts for no "
+            "method. The paper, at 1080p with 8 samples on an RTX 2080 Ti, OPTIMIZED: reducer 3.9 ms, U-Net 18.8, "
+            "partitioner 10.2, filtering 5.3.")
+    return Table(f"Where the time goes, at {samples} samples per pixel",
+                 ("method", *(STAGES[stage] for stage in stages), "all"), rows, note)
+
+
+def savings_table(results: Results) -> Table:
+    """Each other configuration of lbmc against lbmc as it ships: time saved, error added."""
+    rows = []
+    for samples in results.groups():
+        summary = results.summary(samples)
+        for spec in results.methods:
+            if spec.family != "saving" or spec.name not in summary or spec.base not in summary:
+                continue
+            row, base = summary[spec.name], summary[spec.base]
+            rows.append([spec.name, str(samples), _change(row.own_cpu, base.own_cpu),
+                         _change(row.scores["relmse"], base.scores["relmse"]),
+                         _change(row.scores["smape"], base.scores["smape"])])
+    head = ("lbmc as it ships, but", "samples", "CPU time", "relMSE", "SMAPE")
+    return Table("What savings save and cost", head, rows,
+                 "Changes against the same weights as they ship; a plus is slower or worse.")
+
+
+def growth_table(results: Results) -> Table:
+    """Multiply-adds and measured time from 4 to 64 samples per pixel, as in the paper's Figure 10."""
+    counts = sorted({point.samples for point in results.growth})
+    by_network: dict[str, dict[int, list[str]]] = {}
+    for point in results.growth:
+        time = "" if point.cpu is None else f" / {1e6 * point.cpu:.3g}"
+        by_network.setdefault(point.network, {})[point.samples] = [f"{point.multiply_adds / 1e3:,.0f}{time}"]
+    rows = [[name, *(row[samples][0] for samples in counts)] for name, row in by_network.items()]
+    return Table("Cost against samples per pixel", ("network", *(f"{samples} samples" for samples in counts)), rows,
+                 "Thousand multiply-adds per pixel, counted from the networks' widths; after the bar, where measured, "
+                 "CPU microseconds per pixel on random samples.")
+
+
+def published_table(results: Results) -> Table:
+    """The paper's errors, where its networks were timed."""
+    timed = [spec for spec in results.methods if spec.family == "paper"]
+    rows = [[spec.argument, *(f"{value:.4f}" for value in PUBLISHED[spec.argument])] for spec in timed]
+    return Table("As published, not measured here", ("network", "relMSE", "SMAPE"), rows,
+                 "36 images of the authors at 8 samples per pixel, trained by them. Other scenes and other training, "
+                 "so these do not compare with the errors above.")
+
+
+def protocol_lines(results: Results) -> list[str]:
+    """What was run, on what, and how: one statement a line."""
+    machine, protocol = results.machine, results.protocol
+    versions = {key: value for key, value in machine.items() if key not in ("processor", "cores", "threads", "system")}
+    lines = [
+        f"{machine['processor']}; {machine['cores']} cores to run on; {machine['threads']} "
+        f"thread{'s' if machine['threads'] != 1 else ''} used; {machine['system']}.",
+        "Versions: " + ", ".join(f"{name} {value}" for name, value in versions.items()) + ".",
+        f"Every method runs once to warm up and be scored, then all take turns {protocol['repeats']} "
+        f"time{'s' if protocol['repeats'] != 1 else ''}; times are medians, CPU seconds are of all threads.",
+        "Errors are those of the files written (half), on linear RGB at the common scale.",
+    ]
+    if results.memory or any(spec.family == "paper" for spec in results.methods):
+        lines.append(f"Untrained networks and memory are measured on {protocol['example']} alone; memory is what a "
+                     "fresh process takes at its peak beyond its libraries.")
+    if max(scene.megapixels for scene in results.scenes) < 0.5:
+        lines.append("The scenes are small, so that what a run costs at any size (opening files, starting a filter) "
+                     "weighs more than in a film frame; compare methods, do not predict frames.")
+    if results.curve:
+        lines.append("For fewer samples, each pixel draws its own at random; 2 hold the 1, 4 the 2, and so on.")
+    if not protocol["oidn"]:
+        lines.append(INSTALL_OIDN)
+    if not any(spec.family == "lbmc" for spec in results.methods):
+        lines.append("No weights of lbmc ship with this build; name some with --model.")
+    return lines
+
+
+def markdown_report(results: Results) -> str:
+    """results.md."""
+    families = ", ".join(dict.fromkeys(FAMILIES[spec.family] for spec in results.methods))
+    head = f"# Speed against error\n\nMeasured by `lbmc bench`: {families}.\n\n"
+    return head + "\n".join(f"- {line}" for line in protocol_lines(results)) + "\n\n" + "\n".join(
+        table.markdown() for table in all_tables(results))
+
+
+def _errors(row: Summary) -> list[str]:
+    scores: Mapping[str, Any] = row.scores
+    interval = "–" if row.interval is None else f"{row.interval[0]:.4f} to {row.interval[1]:.4f}"
+    digits = {"relmse": 4, "relmse_trimmed": 4, "smape": 4, "psnr": 2, "ssim": 4, "flip": 4, "energy": 3}
+    cells = {name: "–" if scores.get(name) is None else f"{scores[name]:.{places}f}" for name, places in digits.items()}
+    return [cells.pop("relmse"), interval, *cells.values()]
+
+
+def _change(value: float | None, base: float | None) -> str:
+    if value is None or not base:
+        return "–"
+    return f"{100.0 * (value / base - 1.0):+.1f} %"

@@ -1,0 +1,205 @@
+"""`lbmc bench` on two tiny scenes: the three files, what they say, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deep_io import Window
+from model.metrics import score
+from pipelines.bench.methods import SAVINGS, oidn_installed
+from pipelines.compare import read_rgb
+from tests.end_to_end.bench_scenes import write_pair, write_reference
+from tests.end_to_end.scenes import random_weights
+from tests.runner import Finished, Runner, in_process
+
+QUICK = ("--no-paper", "--no-memory", "--no-savings", "--no-curves", "--no-flip", "--repeats", 1, "--progress", "none")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two scenes, and files that are no scenes."""
+    folder = tmp_path_factory.mktemp("scenes")
+    write_pair(folder, "first", 1)
+    write_pair(folder, "second", 2)
+    shutil.copy(folder / "first.deep.exr", folder / "alone.deep.exr")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return random_weights(tmp_path_factory.mktemp("weights") / "tiny.safetensors")
+
+
+@pytest.fixture(scope="module")
+def report(folder: Path, weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bench with everything but the paper's networks, whose time is long."""
+    out = tmp_path_factory.mktemp("bench") / "out"
+    run = in_process("bench", folder, "--out", out, "--model", weights, "--repeats", 2, "--no-paper",
+                     "--progress", "plain")
+    assert run.code == 0, run.err
+    assert "Progress: 100%" in run.err
+    assert run.out.startswith("# Speed against error")
+    return out
+
+
+@pytest.fixture(scope="module")
+def results(report: Path) -> dict[str, Any]:
+    loaded: dict[str, Any] = json.loads((report / "results.json").read_text("utf-8"))
+    return loaded
+
+
+def test_every_method_is_measured_on_every_scene(results: dict[str, Any]) -> None:
+    names = {method["name"] for method in results["methods"]}
+    wanted = {"noisy", "clamp and blur", "à-trous wavelets", "lbmc tiny", *(f"lbmc tiny, {key}" for key in SAVINGS)}
+    if oidn_installed():
+        wanted |= {"OIDN colour", "OIDN + albedo, normal", "OIDN prefiltered"}
+    assert names == wanted
+    assert [scene["name"] for scene in results["scenes"]] == ["first", "second"]
+    assert {(row["scene"], row["method"]) for row in results["measurements"]} == {
+        (scene, name) for scene in ("first", "second") for name in names}
+
+
+def test_errors_are_those_of_the_command_and_the_metrics(
+    results: dict[str, Any], folder: Path, weights: Path, tmp_path: Path
+) -> None:
+    assert in_process("denoise", folder / "first.deep.exr", tmp_path / "out.exr", "--model", weights,
+                      "--threads", 1, "--device", "cpu").code == 0
+    expected = score(read_rgb(tmp_path / "out.exr").rgb, read_rgb(folder / "first.ref.exr").rgb)
+    (found,) = (row for row in results["measurements"] if (row["scene"], row["method"]) == ("first", "lbmc tiny"))
+    for name in ("relmse", "smape", "psnr", "ssim", "flip", "energy"):
+        assert found["scores"][name] == pytest.approx(getattr(expected, name), rel=1e-6), name
+
+
+def test_time_is_split_into_stages(results: dict[str, Any]) -> None:
+    stages = {row["method"]: set(row["cpu"]) for row in results["measurements"]}
+    assert stages["à-trous wavelets"] == {"read", "flatten", "filter", "write"}
+    network = {"read", "survey", "reducer", "unet", "partitioner", "generator", "filter", "write"}
+    assert stages["lbmc tiny"] == network
+    for row in results["measurements"]:
+        assert set(row["cpu"]) == set(row["wall"])
+        assert all(seconds >= 0.0 for seconds in (*row["cpu"].values(), *row["wall"].values()))
+        assert row["wall"]["read"] > 0.0
+
+
+def test_machine_and_protocol_are_stated(results: dict[str, Any], report: Path) -> None:
+    machine, table = results["machine"], (report / "results.md").read_text("utf-8")
+    assert machine["threads"] == 1
+    for name in ("processor", "torch", "numpy", "OpenEXR", "lbmc", "python"):
+        assert machine[name]
+        assert str(machine[name]) in table
+    assert results["protocol"]["repeats"] == 2
+    assert "medians" in table
+
+
+def test_fewer_samples_are_measured_too(results: dict[str, Any]) -> None:
+    assert {(point["scene"], point["samples"]) for point in results["curve"]} == {
+        (scene, samples) for scene in ("first", "second") for samples in (1, 2)}
+    noisy = {point["samples"]: point["relmse"] for point in results["curve"]
+             if (point["scene"], point["method"]) == ("first", "noisy")}
+    assert noisy[1] > noisy[2]
+
+
+def test_growth_counts_the_papers_networks_and_ours(results: dict[str, Any]) -> None:
+    products = {(p["network"], p["samples"]): p["multiply_adds"] for p in results["growth"]}
+    assert {samples for _, samples in products} == {4, 8, 16, 32, 64}
+    growth = {name: products[name, 64] / products[name, 4] for name in ("LAYER", "SAMPLESPLAT")}
+    assert growth["LAYER"] < 1.5 < 4.0 < growth["SAMPLESPLAT"]
+    assert {p["network"] for p in results["growth"] if p["cpu"] is not None} == {"lbmc tiny"}
+
+
+def test_memory_is_measured(results: dict[str, Any]) -> None:
+    if Path("/proc/self/status").is_file():
+        assert set(results["memory"]) == {method["name"] for method in results["methods"]}
+        assert all(0 < peak < 4 << 30 for peak in results["memory"].values())
+        assert results["memory"]["noisy"] < results["memory"]["lbmc tiny"]
+
+
+def test_the_page_asks_for_nothing_from_outside(report: Path) -> None:
+    page = (report / "report.html").read_text("utf-8")
+    assert "default-src 'none'" in page
+    sources = re.findall(r"""(?:src|href|url)\s*[=(:]\s*["']?([^"'\s>)]{5})""", page)
+    assert not [source for source in sources if source.startswith(("http", "//", "file:"))]
+    assert not re.search(r"https?://(?!www\.w3\.org)", page)
+    assert page.count("<svg") >= 5
+    assert "Pareto front" in page
+
+
+def test_an_unscored_network_has_a_time_and_no_error(folder: Path, tmp_path: Path, weights: Path) -> None:
+    """The paper's networks, on one scene of 32 x 24 pixels."""
+    words = [word for word in QUICK if word != "--no-paper"]
+    run = in_process("bench", folder, "--match", "first", "--out", tmp_path, "--model", weights, *words)
+    assert run.code == 0, run.err
+    found = json.loads((tmp_path / "results.json").read_text("utf-8"))
+    rows = {row["method"]: row for row in found["measurements"]}
+    for name in ("PIXELGATHER", "SAMPLESPLAT", "LAYER", "LAYER_w", "OPTIMIZED"):
+        assert rows[f"{name} (untrained)"]["scores"] is None
+        assert rows[f"{name} (untrained)"]["cpu"]["unet"] > 0.0
+    assert {p["network"] for p in found["growth"] if p["cpu"]} == {"LAYER", "SAMPLESPLAT", "lbmc tiny"}
+    assert re.search(r"\| LAYER \(untrained\) \| – \|", run.out)
+
+
+def test_results_that_exist_are_kept(report: Path, folder: Path) -> None:
+    before = (report / "results.json").read_bytes()
+    run = in_process("bench", folder, "--out", report, *QUICK)
+    assert run.code == 2
+    assert "--overwrite" in run.err
+    assert (report / "results.json").read_bytes() == before
+
+
+def test_without_oidn_the_report_says_how_to_get_it(
+    folder: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipelines.bench.job.oidn_installed", lambda: False)
+    run = in_process("bench", folder, "--match", "first", "--out", tmp_path, "--model", weights, *QUICK)
+    assert run.code == 0, run.err
+    assert "| OIDN" not in run.out
+    for name in ("results.md", "report.html"):
+        text = (tmp_path / name).read_text("utf-8").replace("&#x27;", "'")
+        assert "pip install 'lbmc[bench]'" in text
+
+
+def assert_one_line(run: Finished, *words: str) -> None:
+    assert run.code == 3
+    assert run.out == ""
+    assert run.err.startswith("ERROR: ")
+    assert run.err.count("\n") == 1
+    for word in words:
+        assert word in run.err
+
+
+def test_a_folder_without_pairs_is_refused(lbmc: Runner, folder: Path, tmp_path: Path) -> None:
+    shutil.copy(folder / "first.deep.exr", tmp_path / "one.deep.exr")
+    shutil.copy(folder / "first.ref.exr", tmp_path / "other.ref.exr")
+    assert_one_line(lbmc("bench", tmp_path, "--out", tmp_path / "out"), str(tmp_path), "no name in common")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    assert_one_line(in_process("bench", tmp_path / "none"), "none: no such folder")
+
+
+def test_sizes_that_differ_are_both_said(tmp_path: Path) -> None:
+    write_pair(tmp_path, "scene", 1)
+    write_reference(tmp_path / "scene.ref.exr", np.ones((8, 9, 3)), Window(0, 0, 8, 7))
+    assert_one_line(in_process("bench", tmp_path), "scene.deep.exr is 32 x 24", "scene.ref.exr is 9 x 8")
+
+
+@pytest.mark.parametrize(("value", "words"), [(0.0, "no light"), (np.nan, "not finite")])
+def test_references_that_nothing_can_be_measured_on_are_refused(tmp_path: Path, value: float, words: str) -> None:
+    write_pair(tmp_path, "scene", 1)
+    write_reference(tmp_path / "scene.ref.exr", np.full((24, 32, 3), value))
+    assert_one_line(in_process("bench", tmp_path), "scene.ref.exr", words)
+
+
+def test_two_models_of_one_name_are_refused(folder: Path, weights: Path, tmp_path: Path) -> None:
+    shutil.copy(weights, tmp_path / weights.name)
+    run = in_process("bench", folder, "--out", tmp_path / "out", "--model", weights, "--model",
+                     tmp_path / weights.name)
+    assert_one_line(run, "tiny.safetensors", "rename")
