@@ -151,9 +151,10 @@ class Job:
                              f"pass --weighting for the whole sequence")
         roles = tuple(role for role in self.net.config.roles if role in reader.mapping)
         per_pixel = seen.samples / max(seen.pixels, 1)
-        bands = plan_bands(window.height, window.width, per_pixel, self.net.reach, self.net.stride, self.memory)
+        bands = plan_bands(window.height, window.width, per_pixel, self.net.reach, self.net.stride, self.memory,
+                           reader.carried)
         tallest = max(band.read1 - band.read0 for band in bands)
-        needed = memory_needed(tallest, window.width, per_pixel)
+        needed = memory_needed(tallest, window.width, per_pixel, reader.carried)
         return FramePlan(source, seen, self.shot, roles, bands, needed, reader.mapping.lines(), aovs, ids)
 
     def _decide(self, seen: Survey, weighting: str) -> Shot:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 BYTES_PER_SAMPLE = 160  # decoded roles in float32, and what the network holds per sample
 BYTES_PER_PIXEL = 3600  # planes, predictions and context of two layers at their peak
+CARRIED_PER_SAMPLE, CARRIED_PER_PIXEL = 16, 128  # more of both for each channel filtered besides the radiance
 BYTES_BASE = 500 << 20  # the process with its libraries
 DEFAULT_MEMORY = 4 << 30
 
@@ -24,16 +25,19 @@ class Band:
     read1: int
 
 
-def memory_needed(rows: int, width: int, samples_per_pixel: float) -> int:
-    """Estimated peak bytes of denoising so many full rows at once."""
-    return BYTES_BASE + round(rows * width * (BYTES_PER_PIXEL + BYTES_PER_SAMPLE * samples_per_pixel))
+def memory_needed(rows: int, width: int, samples_per_pixel: float, carried: int = 0) -> int:
+    """Estimated peak bytes of denoising so many full rows, with so many further channels, at once."""
+    pixel = BYTES_PER_PIXEL + carried * CARRIED_PER_PIXEL
+    return BYTES_BASE + round(rows * width * (pixel + (BYTES_PER_SAMPLE + carried * CARRIED_PER_SAMPLE)
+                                              * samples_per_pixel))
 
 
-def plan_bands(height: int, width: int, samples_per_pixel: float, reach: int, stride: int, memory: int) -> list[Band]:
+def plan_bands(height: int, width: int, samples_per_pixel: float, reach: int, stride: int, memory: int,
+               carried: int = 0) -> list[Band]:
     """The fewest equal bands that fit the budget; where none fits, bands of one stride, the smallest there are."""
-    if memory_needed(height, width, samples_per_pixel) <= memory:
+    if memory_needed(height, width, samples_per_pixel, carried) <= memory:
         return [Band(0, height, 0, height)]
-    per_row = memory_needed(1, width, samples_per_pixel) - BYTES_BASE
+    per_row = memory_needed(1, width, samples_per_pixel, carried) - BYTES_BASE
     halo = 2 * reach + stride  # above, below, and down to the grid
     fitting = max((memory - BYTES_BASE) // per_row - halo, stride) // stride * stride
     rows = -(-height // -(-height // fitting))  # as many bands, but equal ones
