@@ -1,0 +1,215 @@
+"""The parts of a bench: the clock, thinned scenes, the front, the means, the charts, the growth of cost."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+
+from deep_io import read_deep
+from deep_io.errors import InputError, UsageError
+from model.config import LAYER, SAMPLE_SPLAT
+from model.cost import count
+from model.denoiser import Denoiser
+from pipelines.bench.charts import Line, Mark, Style, bars, lines, number, scatter
+from pipelines.bench.clock import Clock
+from pipelines.bench.growth import growth
+from pipelines.bench.memory import measurable, peak_memory
+from pipelines.bench.methods import MethodSpec, make, method_specs
+from pipelines.bench.report import Gallery
+from pipelines.bench.results import Measurement, Results, SceneInfo, pareto
+from pipelines.bench.scenes import find_scenes, thin, write_thinned
+from tests.end_to_end.bench_scenes import write_pair
+from tests.end_to_end.scenes import noisy_scene
+from tests.model.random_models import SMALL
+
+STYLE = Style("#123456")
+
+
+def wait(seconds: float) -> None:
+    """Keeps the processor busy, so that CPU seconds pass too."""
+    end = time.process_time() + seconds
+    while time.process_time() < end:
+        pass
+
+
+def test_nested_stages_exclude_each_other_and_add_up() -> None:
+    clock = Clock()
+    before = time.process_time()
+    with clock.stage("outer"):
+        wait(0.02)
+        with clock.stage("inner"):
+            wait(0.05)
+        wait(0.01)
+    spent = time.process_time() - before
+    times = clock.take()
+    assert times.cpu["outer"] >= 0.03
+    assert times.cpu["inner"] >= 0.05
+    assert times.cpu["outer"] + times.cpu["inner"] == pytest.approx(spent, abs=0.01)
+    assert times.wall["inner"] >= 0.05
+    assert clock.take().cpu == {}
+
+
+def test_a_stage_that_fails_is_closed() -> None:
+    clock = Clock()
+    with pytest.raises(KeyError), clock.stage("outer"), clock.stage("inner"):
+        raise KeyError
+    with clock.stage("later"):
+        wait(0.01)
+    assert clock.take().cpu["later"] >= 0.01
+
+
+class Worker:
+    def work(self, seconds: float) -> str:
+        wait(seconds)
+        return "done"
+
+    def items(self) -> Iterator[int]:
+        for item in range(3):
+            wait(0.01)
+            yield item
+
+
+def test_watched_methods_return_what_they_did_and_are_timed() -> None:
+    clock, worker, seen = Clock(), Worker(), []
+    clock.watch(worker, "work", "work", seen.append)
+    clock.watch(worker, "items", "items")
+    with clock.stage("rest"):
+        assert worker.work(0.02) == "done"
+        for _ in worker.items():
+            wait(0.02)
+    times = clock.take()
+    assert seen == ["done"]
+    assert times.cpu["work"] >= 0.02
+    assert times.cpu["items"] >= 0.03
+    assert times.cpu["rest"] >= 0.06  # the loop's body is not the generator's
+
+
+def test_thinned_samples_are_nested_and_pixels_with_fewer_keep_theirs() -> None:
+    scene = noisy_scene(3, most=6)
+    values = {**scene.channels, "number": np.arange(scene.total, dtype=np.uint32)}
+    scene.channels = values
+    thinned = {most: thin(scene, most) for most in (1, 2, 4, 8)}
+    for most, found in thinned.items():
+        np.testing.assert_array_equal(found.counts, np.minimum(scene.counts, most))
+        chosen = found.channels["number"].astype(int)
+        assert (np.diff(chosen) > 0).all()  # stored order, nothing twice
+        np.testing.assert_array_equal(scene.pixel_index[chosen], found.pixel_index)
+    for few, many in ((1, 2), (2, 4), (4, 8)):
+        assert set(thinned[few].channels["number"]) <= set(thinned[many].channels["number"])
+    first = thinned[1].channels["number"] - scene.offsets[:-1]
+    assert 0.5 < first.mean() < 2.5  # not always a pixel's first sample
+    np.testing.assert_array_equal(thin(scene, 2).channels["number"], thinned[2].channels["number"])
+
+
+def test_a_thinned_file_is_the_scene_with_fewer_samples(tmp_path: Path) -> None:
+    write_pair(tmp_path, "scene", 1, samples=8)
+    (scene,) = find_scenes(tmp_path)
+    assert scene.thinned_counts() == [1, 2, 4]
+    write_thinned(scene, 2, tmp_path / "two.exr")
+    samples, header = read_deep(tmp_path / "two.exr")
+    assert (samples.counts == 2).all()
+    assert header.data_window == read_deep(scene.source)[1].data_window
+
+
+def test_scenes_are_chosen_by_name(tmp_path: Path) -> None:
+    for name in ("indoor-a", "outdoor-b"):
+        write_pair(tmp_path, name, 1)
+    assert [scene.name for scene in find_scenes(tmp_path, "out*")] == ["outdoor-b"]
+    with pytest.raises(InputError, match=r"no name in common .* 'none\*'"):
+        find_scenes(tmp_path, "none*")
+
+
+def test_the_front_holds_what_nothing_beats() -> None:
+    points = {"slow, good": (9.0, 0.1), "fast, bad": (1.0, 0.9), "beaten": (3.0, 0.95), "middle": (4.0, 0.5),
+              "as good, slower": (5.0, 0.5)}
+    assert pareto(points) == ["fast, bad", "middle", "slow, good"]
+
+
+def test_means_are_per_megapixel_and_geometric_for_relmse() -> None:
+    scenes = [SceneInfo("a", 1000, 1000, 8), SceneInfo("b", 1000, 3000, 8), SceneInfo("c", 10, 10, 32)]
+    spec = MethodSpec("m", "classical", "blur")
+    rows = [Measurement(name, "m", {"relmse": error, "smape": error}, {"read": 1.0, "filter": 2.0}, {"filter": 4.0})
+            for name, error in (("a", 0.01), ("b", 0.04), ("c", 1.0))]
+    results = Results({}, {}, [spec], scenes, rows)
+    assert results.groups() == [8, 32]
+    found = results.summary(8)["m"]
+    assert found.scores["relmse"] == pytest.approx(0.02)
+    assert found.scores["smape"] == pytest.approx(0.025)
+    assert found.cpu == {"read": pytest.approx(0.5), "filter": pytest.approx(1.0)}
+    assert found.own_cpu == pytest.approx(1.0)
+    assert found.own_wall == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(("value", "text"), [(0.0, "0"), (0.01234, "0.0123"), (12.0, "12"), (19612.3, "19,612"),
+                                             (1.5e6, "1.5 M"), (3e-6, "3e-06"), (float("nan"), "–")])
+def test_numbers_are_short(value: float, text: str) -> None:
+    assert number(value) == text
+
+
+def test_charts_are_well_formed_and_show_what_they_are_given() -> None:
+    marks = [Mark("a <b>", STYLE, 1.0, 0.1, "first"), Mark("c", STYLE, 10.0, 0.01, "second"),
+             Mark("no error", STYLE, 5.0, None, "third")]
+    drawn = scatter(marks, ["a <b>", "c"], "seconds", "relMSE")
+    curves = lines([Line("up & down", STYLE, [(1.0, 2.0), (2.0, 1.0)]), Line("none", STYLE, [])], "samples", "error")
+    stacked = bars([("one", {"read": 1.0, "write": 2.0}), ("two", {})], {"read": "#111", "write": "#222"},
+                   {"read": "read", "write": "write"}, "s")
+    for svg in (drawn, curves, stacked):
+        ElementTree.fromstring(svg)
+    assert drawn.count('class="mark"') == 3
+    assert drawn.count('class="front"') == 1
+    assert "a &lt;b&gt;" in drawn
+    assert "up &amp; down" in curves
+    assert "none" not in curves
+    first, second = (float(width) for width in re.findall(r'width="([\d.]+)" height="18"', stacked))
+    assert second == pytest.approx(2 * first, rel=0.01)
+
+
+def test_points_of_a_scatter_stand_where_their_values_are() -> None:
+    svg = scatter([Mark("left", STYLE, 1.0, 1.0, ""), Mark("right", STYLE, 100.0, 0.01, "")], [], "x", "y")
+    places = re.findall(r'cx="([\d.]+)" cy="([\d.]+)"', svg)
+    (left_x, top_y), (right_x, bottom_y) = (map(float, place) for place in places)
+    assert left_x < right_x
+    assert top_y < bottom_y
+
+
+def test_cost_grows_far_slower_for_layers_than_for_samples() -> None:
+    points = {(p.network, p.samples): p for p in growth(
+        {"LAYER": LAYER, "SAMPLESPLAT": SAMPLE_SPLAT}, {"LAYER": Denoiser(SMALL["layer"]).eval()}, [4, 64], 16, 1)}
+    for name, config in (("LAYER", LAYER), ("SAMPLESPLAT", SAMPLE_SPLAT)):
+        expected = sum(count(config).multiply_adds(64, config.layers).values())
+        assert points[name, 64].multiply_adds == expected
+    assert points["LAYER", 4].cpu is not None
+    assert points["SAMPLESPLAT", 4].cpu is None
+
+
+def test_methods_are_named_once_and_models_that_are_not_there_refused(tmp_path: Path) -> None:
+    names = [spec.name for spec in method_specs(("a/x.safetensors", "y"), True, True, True)]
+    assert len(set(names)) == len(names)
+    assert {"lbmc x", "lbmc y", "LAYER_w (untrained)", "OIDN prefiltered"} <= set(names)
+    with pytest.raises(UsageError, match="no such weight file"):
+        make(MethodSpec("m", "lbmc", "lbmc", str(tmp_path / "none.safetensors")), 1, tmp_path)
+
+
+@pytest.mark.skipif(not measurable(), reason="this system does not tell what a process holds")
+def test_memory_is_that_of_the_method_alone(tmp_path: Path) -> None:
+    write_pair(tmp_path, "scene", 1)
+    held = torch.ones(64 << 20)  # 256 MB of ours, which the new process must not be charged for
+    spec = MethodSpec("noisy", "input", "mean")
+    assert 0 < peak_memory(spec, tmp_path / "scene.deep.exr", 1, tmp_path) < held.nbytes
+    with pytest.raises(UsageError, match="noisy"):
+        peak_memory(spec, tmp_path / "missing.exr", 1, tmp_path)
+
+
+def test_large_images_are_cut_to_their_middle() -> None:
+    gallery = Gallery()
+    picture = np.full((10, 1500, 3), 0.5)
+    gallery.add("scene", "reference", picture, picture)
+    assert gallery.sizes["scene"] == (1024, 10)
+    assert gallery.cropped
