@@ -5,9 +5,10 @@ and v the targets' preference for a level, the logit of cell s for target t is
 
     logit = u_s + v_t + log n_s + log B(t - s) - E|f_t - f_s|^2
 
-where the mean is over the pixels of the cell, so that a cell that straddles an edge is far from both sides, B is the quadratic B-spline over three cells (nothing for level 0), so that no cell boundary shows, and n_s the
-occupancy. One normalisation per target over all taps of all levels: out_t = sum_s softmax(logit)_s value_s.
-Targets keep their full resolution at every level, so coarse levels respect edges too.
+where the mean is over the pixels of the cell, so that a cell that straddles an edge is far from both sides, B is the
+quadratic B-spline over three cells (nothing for level 0), so that no cell boundary shows, and n_s the occupancy. One
+normalisation per target over all taps of all levels: out_t = sum_s softmax(logit)_s value_s. Targets keep their full
+resolution at every level, so coarse levels respect edges too.
 """
 
 from __future__ import annotations

@@ -19,6 +19,9 @@ from model.samples import Samples
 
 # Normal, log depth, divisor, glare: the joint bilateral filter at step 0.
 GUIDE_SCALES = (2.0, 2.0, 2.0, 3.0, 1.5, 1.5, 1.5, 2.0)
+# What a log unit of glare takes from a source's logit at each coarser level: a cell that holds a corner of a lamp is
+# hardly farther from its dark pixels than one without, and a thousand times brighter.
+GLARE_PER_LEVEL = 1.0
 GLARE_START = 3.0  # log(1 + exposure L): radiance about 20 times the frame's middle
 DIVISOR_GUIDE_SCALE = 6.0  # the divisor's own, sharper kernel
 
@@ -99,7 +102,9 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
     share = share_of(log_n, log_w)[:, None]
     own = torch.where(share > 0, share, 1)  # values per unit of the layer's own weight: divide by this
     features, bias, preference, gate, *divided = torch.split(predictions, list(generator_sizes(config)), 1)
-    guides = torch.cat([planes[:, GUIDES] / own, glare(planes[:, RADIANCE] / own, scale.exposure)], 1)
+    beyond = glare(planes[:, RADIANCE] / own, scale.exposure)
+    guides = torch.cat([planes[:, GUIDES] / own, beyond], 1)
+    bias = bias - beyond * GLARE_PER_LEVEL * torch.arange(bias.shape[1], device=bias.device)[:, None, None]
     features = features + torch.einsum("bghw,fg->bfhw", guides, guide_matrix) * (2 * torch.sigmoid(gate))
     reduced_too = [planes[:, REDUCED]] if config.demodulation else []
     values = torch.cat([planes[:, FILTERED], share, *reduced_too, planes[:, GUIDED_COLUMNS:]], 1)

@@ -17,7 +17,7 @@ from model.samples import Samples, Segments
 
 PRIOR_WINDOW = 9  # pixels; the neighbourhood that depth is compared with
 OUTLIER_WINDOWS = (3, 9)  # pixels; the neighbourhoods that a sample's radiance is compared with
-OWN_SHARE = 0.5
+OWN_SHARE = 0.8  # all of it would hide a bright sample that has its pixel to itself
 RARE = 4.0  # log units above the mean radiance around: seen in less than about 2 % of the samples
 RADIANCE_LIMIT = 1e18  # in exposure units; sums over a window of such radiance are finite in float32
 OUTLIER_START = 4.0  # log units above the surroundings from which a sample's confidence falls by itself
