@@ -150,6 +150,8 @@ class Job:
             raise InputError(f"{source}: weighting {reader.weighting}, but the first frame has {self.shot.weighting}; "
                              f"pass --weighting for the whole sequence")
         roles = tuple(role for role in self.net.config.roles if role in reader.mapping)
+        if aovs.depth is not None and "depth" not in roles:
+            raise UsageError(f"--aov {aovs.depth}: {self.weights.name} was trained without depth; choose another model")
         per_pixel = seen.samples / max(seen.pixels, 1)
         bands = plan_bands(window.height, window.width, per_pixel, self.net.reach, self.net.stride, self.memory,
                            reader.carried)

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from deep_io.atomic import atomic_output
 from deep_io.attributes import Attribute, attribute
 from deep_io.deep_writer import DeepWriter
-from deep_io.errors import InputError
+from deep_io.errors import InputError, UsageError
 from deep_io.flat import FlatImage, kept_attributes, write_flat_parts
 from deep_io.header import Header, channels_of
 from deep_io.layer_encoding import OverLayers, deep_samples, encode_layers
@@ -50,11 +50,15 @@ class ExportJob(Job):
         self._told = False
 
     def plan(self, source: Path, reader: SampleReader, update: Callable[[float], None]) -> FramePlan:
-        """As for the beauty. Raises InputError for the deep form of a file without depth."""
+        """As for the beauty. The deep form needs depth: InputError for a file, UsageError for a network without."""
         if self.options.form == "deep" and "depth" not in reader.mapping:
             raise InputError(f"{source}: has no depth, which deep layers need; name the layer that holds it with "
                              f"--map depth=LAYER, or write flat layers with --form parts")
-        return super().plan(source, reader, update)
+        plan = super().plan(source, reader, update)
+        if self.options.form == "deep" and "depth" not in plan.roles:
+            raise UsageError(f"--model {self.weights.name}: was trained without depth, so its layers have none; choose "
+                             f"another model, or write flat layers with --form parts")
+        return plan
 
     def frame(self, frame: Frame, progress: Progress) -> DenoisedFrame:
         """Denoises and writes one frame; says once if the layers have no order."""

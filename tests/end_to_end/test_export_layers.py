@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -225,6 +226,21 @@ def test_the_same_input_gives_the_same_bytes(form: str, weights: Weights, source
 def test_flat_layers_need_no_depth(weights: Weights, source: Path, tmp_path: Path) -> None:
     out = lbmc("export-layers", source, tmp_path / "out.exr", weights("fast"), "--form", "parts", "--map", "depth=")
     assert all("Z" not in header.channel_names for header in read_headers(out))
+
+
+def test_a_network_without_depth_writes_flat_layers_only(source: Path, tmp_path: Path) -> None:
+    config = replace(SMALL["layer"], roles=("radiance", "normal", "albedo"))
+    model = tmp_path / "blind.safetensors"
+    zoo.save(random_network(config, 1).float(), model, {})
+    run = in_process("export-layers", source, tmp_path / "deep.exr", "--model", model)
+    assert run.code == 2
+    assert "without depth" in run.err
+    refused = in_process("denoise", source, tmp_path / "out.exr", "--model", model, "--aov", "depth")
+    assert refused.code == 2
+    assert "without depth" in refused.err
+    out = lbmc("export-layers", source, tmp_path / "parts.exr", model, "--form", "parts")
+    assert all("Z" not in header.channel_names for header in read_headers(out))
+    assert not (tmp_path / "deep.exr").exists()
 
 
 def test_layers_without_order_say_so(weights: Weights, source: Path, tmp_path: Path) -> None:
