@@ -30,6 +30,14 @@ from lbmc_cli.options import PROGRESS, LbmcCommand, option
 @option("--match", default="*", show_default=True, metavar="GLOB", help="Only scenes whose NAME matches.")
 @option("--threads", type=click.IntRange(1), default=1, show_default=True, metavar="N", help="CPU threads.")
 @option("--repeats", type=click.IntRange(1), default=3, show_default=True, help="Timed runs of each method and scene.")
+@option(
+    "--frame",
+    type=click.IntRange(0),
+    default=512,
+    show_default=True,
+    metavar="PIXELS",
+    help="Side of the frames that are timed, scenes repeated to that size; 0: every scene as it is.",
+)
 @option("--no-paper", is_flag=True, help="Leave the paper's networks out (they have no weights, only a time).")
 @option("--no-curves", is_flag=True, help="Leave the error at fewer samples per pixel out.")
 @option("--no-savings", is_flag=True, help="Leave lbmc in other configurations out.")

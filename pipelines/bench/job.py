@@ -1,7 +1,7 @@
 """The protocol of a bench: what runs in which order, what is kept, and the three files that come out.
 
-Every method runs once on every scene to warm up and to be scored; then all methods take turns, `repeats` times, and
-the medians of their times count. Errors are those of the files written, in half precision.
+Every method runs once on every scene to be scored. Then all methods take turns on the frames that are timed, once to
+warm up and `repeats` times more, of which the medians count. Errors are those of the files written, in half precision.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pipelines.bench.memory import measurable, peak_memory
 from pipelines.bench.methods import PAPER, LbmcMethod, Method, MethodSpec, make, method_specs, oidn_installed
 from pipelines.bench.report import Gallery, html_report
 from pipelines.bench.results import CurvePoint, Measurement, Results, SceneInfo, machine
-from pipelines.bench.scenes import Scene, find_scenes, write_thinned
+from pipelines.bench.scenes import Scene, find_scenes, write_enlarged, write_thinned
 from pipelines.bench.tables import markdown_report
 from pipelines.compare import read_rgb
 from pipelines.progress import Progress, ProgressKind, make_progress
@@ -46,6 +46,8 @@ class BenchOptions:
     """What a bench is told.
 
     models : presets or weight files; none: the presets that ship
+    frame : pixels along a side of the frames that are timed: the first scene of each number of samples, repeated in
+        mirror image; 0: every scene as it is, with what small frames cost on top
     match : only scenes whose name matches this glob
     paper : also time the paper's networks, which have random weights and no error
     curves : also thin the scenes to 1, 2, 4, ... samples per pixel
@@ -60,6 +62,7 @@ class BenchOptions:
     match: str = "*"
     threads: int = 1
     repeats: int = 3
+    frame: int = 512
     paper: bool = True
     curves: bool = True
     savings: bool = True
@@ -94,6 +97,15 @@ def bench(options: BenchOptions) -> Results:
     return results
 
 
+@dataclass(frozen=True)
+class TimedFrame:
+    """A file that is timed."""
+
+    name: str
+    source: Path
+    megapixels: float
+
+
 class Bench:
     """One run: the methods made ready, and their results as they come."""
 
@@ -116,6 +128,7 @@ class Bench:
         protocol = {
             "repeats": options.repeats, "warm_up": 1, "interleaved": True, "statistic": "median",
             "oidn": oidn_installed(), "growth_pixels": SIDE * SIDE,
+            "frame": options.frame,
         }
         self.results = Results(machine(options.threads), protocol, self.specs, infos)
         # One scene stands for all where each run is dear: the first of the largest group.
@@ -133,12 +146,13 @@ class Bench:
         """Everything, in order."""
         options = self.options
         curves = [(scene, most) for scene in self.scenes for most in scene.thinned_counts()] if options.curves else []
-        steps = len(self.scenes) * (1 + options.repeats) + len(curves) + len(options.growth)
+        frames = self._frames()
+        steps = len(self.scenes) + len(frames) * (1 + options.repeats) + len(curves) + len(options.growth)
         with_memory = options.memory and measurable()
         steps += len(self.specs) if with_memory else 0
         with make_progress(options.progress, steps) as progress:
             scores = {scene.name: dict(self._score(scene)) for scene in _steps(self.scenes, progress, "errors of")}
-            self._time(scores, progress)
+            self._time(frames, scores, progress)
             for scene, most in curves:
                 progress.begin(f"{scene.name} with {most} samples")
                 self._curve(scene, most)
@@ -147,7 +161,7 @@ class Bench:
             if with_memory:
                 for spec in _steps(self.specs, progress, "memory of"):
                     self.results.memory[spec.name] = peak_memory(
-                        spec, self.example.source, options.threads, self.folder)
+                        spec, frames[self.example.name].source, options.threads, self.folder)
         return self.results, self.gallery
 
     def _run(self, spec: MethodSpec, source: Path) -> Times:
@@ -156,33 +170,47 @@ class Bench:
         return method.clock.take()
 
     def _score(self, scene: Scene) -> Iterator[tuple[str, dict[str, float | None]]]:
-        """Errors of all methods on a scene; this also warms them up."""
+        """Errors of all methods on a scene."""
         reference = scene.reference.rgb
         self.gallery.add(scene.name, "reference", reference, reference)
-        for spec in self._on(scene):
-            self._run(spec, scene.source)
+        for spec in self.specs:
             if not spec.scored:
                 continue
+            self._run(spec, scene.source)
             picture = read_rgb(self.target).rgb
             yield spec.name, asdict(score(picture, reference, with_flip=self.options.flip))
             if spec.family != "saving":
                 self.gallery.add(scene.name, spec.name, picture, reference)
 
-    def _on(self, scene: Scene) -> list[MethodSpec]:
-        """The methods that run on a scene: all on the example, those that have an error on the others."""
-        return [spec for spec in self.specs if spec.scored or scene is self.example]
+    def _frames(self) -> dict[str, TimedFrame]:
+        """What is timed, by the name of the scene that it is made of."""
+        if not self.options.frame:
+            return {scene.name: TimedFrame(scene.name, scene.source, scene.megapixels) for scene in self.scenes}
+        frames = {}
+        for samples in self.results.groups():
+            scene = next(scene for scene in self.scenes if scene.samples == samples)
+            source = self.folder / f"{scene.name}.frame.exr"
+            frames[scene.name] = TimedFrame(scene.name, source, write_enlarged(scene, self.options.frame, source))
+        return frames
 
-    def _time(self, scores: dict[str, dict[str, dict[str, float | None]]], progress: Progress) -> None:
+    def _time(self, frames: dict[str, TimedFrame], scores: dict[str, dict[str, dict[str, float | None]]],
+              progress: Progress) -> None:
         runs: dict[tuple[str, str], list[Times]] = {}
-        for _ in range(self.options.repeats):
-            for scene in _steps(self.scenes, progress, "times of"):
-                for spec in self._on(scene):
-                    runs.setdefault((scene.name, spec.name), []).append(self._run(spec, scene.source))
-        for (scene_name, name), times in runs.items():
-            self.results.measurements.append(Measurement(
-                scene_name, name, scores[scene_name].get(name),
-                _median([run.cpu for run in times]), _median([run.wall for run in times]),
-            ))
+        for _ in range(1 + self.options.repeats):
+            for frame in _steps(frames.values(), progress, "times of"):
+                for spec in self.specs:
+                    if spec.scored or frame.name == self.example.name:
+                        runs.setdefault((frame.name, spec.name), []).append(self._run(spec, frame.source))
+        for scene in self.scenes:
+            for spec in self.specs:
+                times = runs.get((scene.name, spec.name), [])[1:]
+                found = scores[scene.name].get(spec.name)
+                if times or found:
+                    self.results.measurements.append(Measurement(
+                        scene.name, spec.name, found,
+                        _median([run.cpu for run in times]), _median([run.wall for run in times]),
+                        frames[scene.name].megapixels if times else 0.0,
+                    ))
 
     def _curve(self, scene: Scene, most: int) -> None:
         thinned = self.folder / "thinned.deep.exr"

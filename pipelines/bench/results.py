@@ -38,13 +38,17 @@ class SceneInfo:
 
 @dataclass(frozen=True)
 class Measurement:
-    """One method on one scene: its scores (None for random weights), and its median seconds by stage."""
+    """One method on one scene: its scores (None for random weights), and its median seconds by stage.
+
+    megapixels : of the frame that was timed, which may be the scene enlarged; 0, and no seconds, where none was
+    """
 
     scene: str
     method: str
     scores: Mapping[str, float | None] | None
     cpu: Mapping[str, float]
     wall: Mapping[str, float]
+    megapixels: float
 
 
 @dataclass(frozen=True)
@@ -97,12 +101,12 @@ class Results:
 
     def summary(self, samples: int) -> dict[str, Summary]:
         """The means of each method that was measured over the scenes of a group."""
-        scenes = {scene.name: scene for scene in self.scenes_of(samples)}
+        scenes = {scene.name for scene in self.scenes_of(samples)}
         found: dict[str, Summary] = {}
         for spec in self.methods:
             rows = [row for row in self.measurements if row.method == spec.name and row.scene in scenes]
             if rows:
-                found[spec.name] = summarize(rows, sum(scenes[row.scene].megapixels for row in rows))
+                found[spec.name] = summarize(rows)
         return found
 
 
@@ -132,8 +136,9 @@ def own(stages: Mapping[str, float]) -> float:
     return sum(seconds for stage, seconds in stages.items() if stage not in OUTSIDE)
 
 
-def summarize(rows: list[Measurement], megapixels: float) -> Summary:
-    """The rows of one method, over scenes of so many megapixels together."""
+def summarize(rows: list[Measurement]) -> Summary:
+    """The rows of one method, over scenes."""
+    megapixels = sum(row.megapixels for row in rows)
     scores: dict[str, float | None] = {}
     interval = None
     scored = [row.scores for row in rows if row.scores is not None]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from deep_io import DeepSamples, read_deep, write_deep
+from deep_io import DeepSamples, Window, read_deep, write_deep
 from deep_io.errors import InputError
 from deep_io.path_samples import SampleReader
 from model.metrics import common_scale
@@ -106,6 +107,34 @@ def thin(samples: DeepSamples, most: int, seed: int = SEED) -> DeepSamples:
     kept = rank < most
     channels = {name: values[kept] for name, values in samples.channels.items()}
     return DeepSamples(np.minimum(samples.counts, most).astype(np.int32), channels, samples.window)
+
+
+def enlarge(samples: DeepSamples, side: int) -> DeepSamples:
+    """The frame repeated in mirror image, to `side` pixels along each side that has fewer, at the origin."""
+    height, width = samples.counts.shape
+    rows, columns = (_mirrored(size, max(size, side)) for size in (height, width))
+    pixels = (rows[:, None] * width + columns).ravel()
+    counts = samples.counts.ravel()[pixels]
+    ends = np.cumsum(counts, dtype=np.int64)
+    start = np.repeat(samples.offsets[pixels] - (ends - counts), counts)
+    chosen = start + np.arange(start.size)
+    channels = {name: values[chosen] for name, values in samples.channels.items()}
+    window = Window(0, 0, len(columns) - 1, len(rows) - 1)
+    return DeepSamples(counts.reshape(len(rows), len(columns)), channels, window)
+
+
+def _mirrored(size: int, length: int) -> NDArray[np.int64]:
+    """0 .. size-1, back to 0, and so on: (length,)."""
+    place = np.arange(length) % (2 * size)
+    return np.minimum(place, 2 * size - 1 - place)
+
+
+def write_enlarged(scene: Scene, side: int, target: Path) -> float:
+    """Writes the scene enlarged to `side` x `side` pixels or more; returns its megapixels."""
+    samples, header = read_deep(scene.source)
+    large = enlarge(samples, side)
+    write_deep(target, large, replace(header, data_window=large.window, display_window=large.window))
+    return large.counts.size / 1e6
 
 
 def write_thinned(scene: Scene, most: int, target: Path) -> None:

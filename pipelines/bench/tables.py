@@ -10,6 +10,8 @@ from pipelines.bench.charts import number
 from pipelines.bench.methods import FAMILIES, OUTSIDE, STAGES
 from pipelines.bench.results import Results, Summary, pareto
 
+SMALL_FRAME = 0.2
+"""Megapixels of a timed frame below which the page warns of costs that do not grow with it."""
 FULL_HD = 1920 * 1080 / 1e6
 """Megapixels of the frame that times per megapixel are scaled to for a reader."""
 
@@ -148,15 +150,15 @@ def protocol_lines(results: Results) -> list[str]:
         f"{machine['processor']}; {machine['cores']} cores to run on; {machine['threads']} "
         f"thread{'s' if machine['threads'] != 1 else ''} used; {machine['system']}.",
         "Versions: " + ", ".join(f"{name} {value}" for name, value in versions.items()) + ".",
-        f"Every method runs once to warm up and be scored, then all take turns {protocol['repeats']} "
-        f"time{'s' if protocol['repeats'] != 1 else ''}; times are medians, CPU seconds are of all threads.",
+        _timed(protocol["frame"]) + f", where all methods take turns: once to warm up, then {protocol['repeats']} "
+        f"time{'s' if protocol['repeats'] != 1 else ''}, of which the median counts. CPU seconds are of all threads.",
         "Errors are those of the files written (half), on linear RGB at the common scale.",
     ]
     if results.memory or any(spec.family == "paper" for spec in results.methods):
         lines.append(f"Untrained networks and memory are measured on {protocol['example']} alone; memory is what a "
                      "fresh process takes at its peak beyond its libraries.")
-    if max(scene.megapixels for scene in results.scenes) < 0.5:
-        lines.append("The scenes are small, so that what a run costs at any size (opening files, starting a filter) "
+    if max(row.megapixels for row in results.measurements) < SMALL_FRAME:
+        lines.append("The frames are small, so that what a run costs at any size (opening files, starting a filter) "
                      "weighs more than in a film frame; compare methods, do not predict frames.")
     if results.curve:
         lines.append("For fewer samples, each pixel draws its own at random; 2 hold the 1, 4 the 2, and so on.")
@@ -173,6 +175,13 @@ def markdown_report(results: Results) -> str:
     head = f"# Speed against error\n\nMeasured by `lbmc bench`: {families}.\n\n"
     return head + "\n".join(f"- {line}" for line in protocol_lines(results)) + "\n\n" + "\n".join(
         table.markdown() for table in all_tables(results))
+
+
+def _timed(frame: int) -> str:
+    if not frame:
+        return "Times are of every scene as it is"
+    return ("Times are of the first scene of each number of samples, repeated in mirror image to "
+            f"{frame} x {frame} pixels")
 
 
 def _errors(row: Summary) -> list[str]:

@@ -19,7 +19,8 @@ from tests.end_to_end.bench_scenes import write_pair, write_reference
 from tests.end_to_end.scenes import random_weights
 from tests.runner import Finished, Runner, in_process
 
-QUICK = ("--no-paper", "--no-memory", "--no-savings", "--no-curves", "--no-flip", "--repeats", 1, "--progress", "none")
+QUICK = ("--no-paper", "--no-memory", "--no-savings", "--no-curves", "--no-flip", "--repeats", 1, "--frame", 0,
+         "--progress", "none")
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +42,8 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def report(folder: Path, weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bench with everything but the paper's networks, whose time is long."""
     out = tmp_path_factory.mktemp("bench") / "out"
-    run = in_process("bench", folder, "--out", out, "--model", weights, "--repeats", 2, "--no-paper",
-                     "--progress", "plain")
+    run = in_process("bench", folder, "--out", out, "--model", weights, "--repeats", 2, "--frame", 0,
+                     "--no-paper", "--progress", "plain")
     assert run.code == 0, run.err
     assert "Progress: 100%" in run.err
     assert run.out.startswith("# Speed against error")
@@ -86,6 +87,17 @@ def test_time_is_split_into_stages(results: dict[str, Any]) -> None:
         assert set(row["cpu"]) == set(row["wall"])
         assert all(seconds >= 0.0 for seconds in (*row["cpu"].values(), *row["wall"].values()))
         assert row["wall"]["read"] > 0.0
+
+
+def test_times_can_be_of_a_larger_frame(folder: Path, weights: Path, tmp_path: Path) -> None:
+    words = [48 if word == 0 else word for word in QUICK]
+    run = in_process("bench", folder, "--out", tmp_path, "--model", weights, *words)
+    assert run.code == 0, run.err
+    assert "repeated in mirror image to 48 x 48" in run.out
+    rows = json.loads((tmp_path / "results.json").read_text("utf-8"))["measurements"]
+    assert all(row["scores"] for row in rows)
+    timed = {(row["scene"], row["megapixels"]) for row in rows if row["cpu"]}
+    assert timed == {("first", 48 * 48 / 1e6)}
 
 
 def test_machine_and_protocol_are_stated(results: dict[str, Any], report: Path) -> None:

@@ -25,7 +25,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         write_pair(folder, name, seed)
     weights = random_weights(folder / "tiny.safetensors")
     run = in_process("bench", folder, "--out", folder, "--model", weights, "--no-paper", "--no-memory", "--no-savings",
-                     "--no-flip", "--repeats", 1, "--progress", "none")
+                     "--no-flip", "--repeats", 1, "--frame", 0, "--progress", "none")
     assert run.code == 0, run.err
     options = selenium.ChromeOptions()
     options.binary_location = BROWSER

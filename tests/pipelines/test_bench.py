@@ -24,8 +24,8 @@ from pipelines.bench.memory import measurable, peak_memory
 from pipelines.bench.methods import MethodSpec, make, method_specs
 from pipelines.bench.report import Gallery
 from pipelines.bench.results import Measurement, Results, SceneInfo, pareto
-from pipelines.bench.scenes import find_scenes, thin, write_thinned
-from tests.end_to_end.bench_scenes import write_pair
+from pipelines.bench.scenes import enlarge, find_scenes, thin, write_thinned
+from tests.end_to_end.bench_scenes import WINDOW, write_pair
 from tests.end_to_end.scenes import noisy_scene
 from tests.model.random_models import SMALL
 
@@ -118,6 +118,21 @@ def test_a_thinned_file_is_the_scene_with_fewer_samples(tmp_path: Path) -> None:
     assert header.data_window == read_deep(scene.source)[1].data_window
 
 
+def test_an_enlarged_scene_is_its_mirror_images() -> None:
+    scene = noisy_scene(2, WINDOW)
+    scene.channels = {"number": np.arange(scene.total, dtype=np.uint32)}
+    large = enlarge(scene, 70)
+    assert large.counts.shape == (70, 70)
+    height, width = scene.counts.shape
+    for y, x, old_y, old_x in ((0, 0, 0, 0), (height, 3, height - 1, 3), (5, width + 2, 5, width - 3),
+                               (2 * height, 2 * width, 0, 0), (69, 69, 69 - 2 * height, 69 - 2 * width)):
+        new, old = y * 70 + x, old_y * width + old_x
+        np.testing.assert_array_equal(
+            large.channels["number"][large.offsets[new] : large.offsets[new + 1]],
+            np.arange(scene.offsets[old], scene.offsets[old + 1]))
+    assert enlarge(scene, 8).counts.shape == (height, width)
+
+
 def test_scenes_are_chosen_by_name(tmp_path: Path) -> None:
     for name in ("indoor-a", "outdoor-b"):
         write_pair(tmp_path, name, 1)
@@ -135,8 +150,8 @@ def test_the_front_holds_what_nothing_beats() -> None:
 def test_means_are_per_megapixel_and_geometric_for_relmse() -> None:
     scenes = [SceneInfo("a", 1000, 1000, 8), SceneInfo("b", 1000, 3000, 8), SceneInfo("c", 10, 10, 32)]
     spec = MethodSpec("m", "classical", "blur")
-    rows = [Measurement(name, "m", {"relmse": error, "smape": error}, {"read": 1.0, "filter": 2.0}, {"filter": 4.0})
-            for name, error in (("a", 0.01), ("b", 0.04), ("c", 1.0))]
+    rows = [Measurement(name, "m", {"relmse": error, "smape": error}, {"read": 1.0, "filter": 2.0}, {"filter": 4.0},
+                        size) for name, error, size in (("a", 0.01, 1.0), ("b", 0.04, 3.0), ("c", 1.0, 1e-4))]
     results = Results({}, {}, [spec], scenes, rows)
     assert results.groups() == [8, 32]
     found = results.summary(8)["m"]
