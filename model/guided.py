@@ -1,8 +1,8 @@
 """The affinity kernels' stage: what is splatted besides radiance, how kernels are predicted, the demodulated path.
 
-Features for the affinity are predicted per layer and pixel; guides (normal, log depth, divisor, glare) are added to
-them with a learned matrix, so that the kernel is a joint bilateral filter before any training. `affinity.py` has the
-filter.
+Features for the affinity are predicted per layer and pixel; guides (normal, log depth, divisor) are added to them with
+a learned matrix, so that the kernel is a joint bilateral filter before any training. Glare is a feature of its own.
+`affinity.py` has the filter.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from model.networks import Mlp
 from model.partition import BASIC_COLUMNS, FILTERED, hit_depth, share_of
 from model.samples import Samples
 
-# Normal, log depth, divisor, glare: the joint bilateral filter at step 0.
-GUIDE_SCALES = (2.0, 2.0, 2.0, 3.0, 1.5, 1.5, 1.5, 2.0)
+GUIDE_SCALES = (2.0, 2.0, 2.0, 3.0, 1.5, 1.5, 1.5)  # normal, log depth, divisor: the joint bilateral filter at step 0
 # What a log unit of glare takes from a source's logit at each coarser level: a cell that holds a corner of a lamp is
 # hardly farther from its dark pixels than one without, and a thousand times brighter.
 GLARE_PER_LEVEL = 1.0
+GLARE_SCALE = 2.0  # of glare as a feature
 GLARE_START = 3.0  # log(1 + exposure L): radiance about 20 times the frame's middle
 DIVISOR_GUIDE_SCALE = 6.0  # the divisor's own, sharper kernel
 
@@ -46,8 +46,8 @@ def guide_values(samples: Samples, scale: FrameScale) -> Tensor:
 def glare(radiance: Tensor, exposure: float) -> Tensor:
     """Radiance (B, 3, H, W) -> (B, 1, H, W): log units beyond GLARE_START, else 0.
 
-    As a guide it keeps lamps, a thousand times their surroundings, from leaking out of their edges; radiance below
-    is no guide, since its differences are mostly noise.
+    As a feature it keeps lamps, a thousand times their surroundings, from leaking out of their edges; radiance below
+    is no guide, since its differences are mostly noise. It is not learned: no training scene has such contrast.
     """
     return (log_radiance(radiance.amax(1, keepdim=True), exposure) - GLARE_START).clamp_min(0)
 
@@ -103,9 +103,10 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
     own = torch.where(share > 0, share, 1)  # values per unit of the layer's own weight: divide by this
     features, bias, preference, gate, *divided = torch.split(predictions, list(generator_sizes(config)), 1)
     beyond = glare(planes[:, RADIANCE] / own, scale.exposure)
-    guides = torch.cat([planes[:, GUIDES] / own, beyond], 1)
+    guides = planes[:, GUIDES] / own
     bias = bias - beyond * GLARE_PER_LEVEL * torch.arange(bias.shape[1], device=bias.device)[:, None, None]
     features = features + torch.einsum("bghw,fg->bfhw", guides, guide_matrix) * (2 * torch.sigmoid(gate))
+    features = torch.cat([features, GLARE_SCALE * beyond], 1)
     reduced_too = [planes[:, REDUCED]] if config.demodulation else []
     values = torch.cat([planes[:, FILTERED], share, *reduced_too, planes[:, GUIDED_COLUMNS:]], 1)
     out = affinity_filter(features, bias, preference, log_n, values, config.kernel_sizes)
