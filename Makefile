@@ -1,5 +1,6 @@
 # make demo   denoise the examples           make test   linters, types, and the tests against the built wheel
-# Both make their own virtual environment in .venv and need nothing before them but Python 3.11 or newer.
+# make bench  speed against error on the examples, as a table and a page in build/bench
+# All make their own virtual environment in .venv and need nothing before them but Python 3.11 or newer.
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
@@ -12,7 +13,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --quiet
 SOURCES := $(shell find deep_io lbmc_cli model pipelines -type f -not -path '*/__pycache__/*')
 TESTBED := build/testbed
 
-.PHONY: demo test lint clean
+.PHONY: demo bench test lint clean
 .DEFAULT_GOAL := demo
 
 $(VENV)/made:
@@ -43,6 +44,9 @@ $(VENV)/tested: build/wheel constraints.txt
 
 demo: $(VENV)/runtime
 	@PATH=$(BIN):$$PATH examples/demo.sh build/demo
+
+bench: $(VENV)/tested
+	@$(BIN)/lbmc bench examples/scenes --out build/bench --overwrite
 
 lint: $(VENV)/tested
 	$(BIN)/ruff check .
