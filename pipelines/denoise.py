@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import torch
 
 from deep_io import sequences
 from deep_io.atomic import atomic_output, output_action
-from deep_io.errors import InputError, UsageError
+from deep_io.errors import InputError, LbmcError, UsageError
 from deep_io.flat import to_half, write_flat
 from deep_io.header import Header
 from deep_io.path_samples import SampleReader
@@ -109,6 +110,7 @@ class Job:
             raise UsageError(f"--layers {options.layers}: {self.weights.name} has up to "
                              f"{self.net.config.partition_logits}")
         self.shot: Shot | None = None
+        self.sources: list[Path] = []
 
     def open(self, source: Path) -> SampleReader:
         """Opens an input with the reading options. Refuses what lbmc wrote unless forced."""
@@ -145,7 +147,7 @@ class Job:
 
         seen = survey(counted())
         if self.shot is None:
-            self.shot = self._decide(seen, reader.weighting)
+            self.shot = self._decide(source, seen, reader.weighting)
         if reader.weighting != self.shot.weighting:
             raise InputError(f"{source}: weighting {reader.weighting}, but the first frame has {self.shot.weighting}; "
                              f"pass --weighting for the whole sequence")
@@ -159,15 +161,23 @@ class Job:
         needed = memory_needed(tallest, window.width, per_pixel, reader.carried)
         return FramePlan(source, seen, self.shot, roles, bands, needed, reader.mapping.lines(), aovs, ids)
 
-    def _decide(self, seen: Survey, weighting: str) -> Shot:
+    def _decide(self, source: Path, seen: Survey, weighting: str) -> Shot:
         """The shot's scale, both numbers of it, comes from one frame: chunks of a shot that name it agree exactly."""
         options = self.options
-        key = seen if options.exposure_from is None else self._survey_of(options.exposure_from)
+        key = self._first_survey(source, seen) if options.exposure_from is None else self._survey_of(
+            options.exposure_from)
         scale = FrameScale(options.exposure or key.exposure, key.depth)
         needed = self.net.config.layers
         if options.adapt and key.mixed is not None and key.mixed < FEW_MIXED:
             needed = 1
         return Shot(scale, options.layers or needed, weighting)
+
+    def _first_survey(self, source: Path, seen: Survey) -> Survey:
+        """That of the job's first readable frame: a job resumed past frames that exist decides as it did at first."""
+        for earlier in self.sources[:self.sources.index(source)] if source in self.sources else ():
+            with suppress(LbmcError):
+                return self._survey_of(os.fspath(earlier))
+        return seen
 
     def _survey_of(self, frame: str) -> Survey:
         source = Path(frame)
@@ -187,8 +197,9 @@ class Job:
         with self.open(frame.source) as reader:
             plan = self.plan(frame.source, reader, progress.update)
             if self.options.dry_run:
+                print(f"{frame.source} -> {', '.join(map(str, targets))}")
                 for line in plan.lines():
-                    print(line)
+                    print(f"  {line}")
                 return DenoisedFrame(None, plan)
             tell_repairs(frame.source, plan.survey.repairs, progress)
             surveyed = time.perf_counter()
@@ -268,6 +279,7 @@ def run_job(kind: type[Job], options: DenoiseOptions) -> JobReport[DenoisedFrame
     """Runs a job of some kind on the frames that its options name; raises what `denoise_frames` does."""
     frames = sequences.pair(options.source, options.target, options.frames)
     job = kind(options)
+    job.sources = [frame.source for frame in frames]
     if not options.dry_run:
         for frame in frames:  # a refused output is found before hours of work, not after
             for target in job.targets(frame):

@@ -98,6 +98,21 @@ def test_a_frame_that_fails_does_not_stop_the_others_and_is_listed_at_the_end(we
     assert "2 of 3 frames done, 1 failed" in run.err
 
 
+def test_a_resumed_sequence_gives_the_bytes_of_one_that_was_never_stopped(weights: Path, tmp_path: Path) -> None:
+    for number in (1, 2, 3):
+        scene = noisy_scene(number, TINY)
+        brighter = {name: scene.channels[name] * np.float16(number) for name in "RGB"}
+        write_scene(tmp_path / f"in.{number}.exr", changed(scene, **brighter))
+    broken = tmp_path / "in.1.exr"
+    broken.write_bytes(broken.read_bytes()[:-200])
+    words = ("denoise", tmp_path / "in.#.exr", tmp_path / "out.#.exr", "--model", weights, "--skip-existing")
+    assert in_process(*words).code == 1
+    whole = (tmp_path / "out.3.exr").read_bytes()
+    (tmp_path / "out.3.exr").unlink()
+    assert in_process(*words).code == 1  # frame 1 fails again, 2 decides although it is skipped
+    assert (tmp_path / "out.3.exr").read_bytes() == whole
+
+
 def test_an_existing_output_is_refused_kept_or_replaced(weights: Path, tmp_path: Path) -> None:
     source, output = write_scene(tmp_path / "in.exr", noisy_scene(3, TINY)), tmp_path / "out.exr"
     output.write_text("precious")
@@ -161,6 +176,7 @@ def test_a_dry_run_says_everything_and_writes_nothing(weights: Path, tmp_path: P
     assert list(tmp_path.iterdir()) == [source]
     for word in ("radiance   <- R G B", "weighting: uniform", "layers: ", "exposure: ", "MiB"):
         assert word in run.out
+    assert run.out.startswith(f"{source} -> {tmp_path / 'out.exr'}\n")
 
 
 def test_a_gpu_that_is_not_there_is_a_usage_error(weights: Path, tmp_path: Path) -> None:
