@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_io.aliases import CAMERA_Z_FORWARD, DISTANCE, VIEW, WORLD
+from deep_io.aliases import CAMERA_Z_FORWARD, DISTANCE, PLANAR, VIEW, WORLD
 from deep_io.camera import Camera, camera_of
 from deep_io.errors import InputError, UsageError
 from deep_io.header import Header
@@ -53,13 +53,14 @@ class Conventions:
         return self.camera.planar_factor(window, header.display_window, header.pixel_aspect) if self.distance else None
 
 
-def resolve(header: Header, mapping: RoleMap, path: str, normals: str = "auto", depth: str = "z",
+def resolve(header: Header, mapping: RoleMap, path: str, normals: str = "auto", depth: str = "auto",
             camera: Camera | None = None, strict: bool = True) -> Conventions:
     """The conventions of a file, from the alias table, the header and the options.
 
     Parameters
         normals  "auto": as the header's lbmc:normals or the alias table says; "world", "view": whatever they say
-        depth    "z": as the header's lbmc:depth or the alias table says, planar by default; "distance": ray length
+        depth    "auto": as the header's lbmc:depth or the alias table says; "z" (planar), "distance" (the ray's
+                 length): whatever they say
         camera   takes precedence over the header's worldToCamera
         strict   False leaves a conversion that lacks its camera to the caller, who checks `camera`
     Raises InputError when world normals have no worldToCamera or ray lengths no field of view; UsageError for an
@@ -67,15 +68,17 @@ def resolve(header: Header, mapping: RoleMap, path: str, normals: str = "auto", 
     """
     if normals not in ("auto", "world", "view"):
         raise UsageError(f"--normals {normals}: must be auto, world or view")
-    if depth not in ("z", "distance"):
-        raise UsageError(f"--depth {depth}: must be z or distance")
+    if depth not in ("auto", PLANAR, DISTANCE):
+        raise UsageError(f"--depth {depth}: must be auto, z or distance")
     space = normals
     if normals == "auto":
         space = str(header.get(NORMALS_ATTRIBUTE, mapping["normal"].space)) if "normal" in mapping else VIEW
     source = mapping.sources.get("depth")
-    by_table = source is not None and header.get(DEPTH_ATTRIBUTE, source.depth) == DISTANCE
+    kind = depth
+    if depth == "auto":
+        kind = str(header.get(DEPTH_ATTRIBUTE, source.depth)) if source is not None else PLANAR
     found = (camera or Camera()).merged(camera_of(header.attributes))
-    conventions = Conventions(space, source is not None and (depth == "distance" or by_table),
+    conventions = Conventions(space, source is not None and kind == DISTANCE,
                               source is not None and source.zero_is_miss, found)
     if strict and conventions.space == WORLD and "normal" in mapping and found.world_to_camera is None:
         raise InputError(f"{path}: the normals ({mapping['normal'].layer}) are in world space and the header has no "
@@ -83,8 +86,8 @@ def resolve(header: Header, mapping: RoleMap, path: str, normals: str = "auto", 
                          f"space, or leave them out with --map normal=none")
     if strict and conventions.distance and found.field_of_view is None:
         raise InputError(f"{path}: the depth ({mapping['depth'].layer}) is the length of the ray, and planar depth "
-                         f"needs the field of view; give it with --camera DEGREES, or leave depth out with "
-                         f"--map depth=none")
+                         f"needs the field of view; give it with --camera DEGREES, pass --depth z if it is planar, "
+                         f"or leave depth out with --map depth=none")
     if conventions.space == WORLD and found.world_to_camera is not None:
         try:
             found.view_normals()

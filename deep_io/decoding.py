@@ -93,7 +93,7 @@ class Interpretation:
 
 
 def interpretation(header: Header, path: str, overrides: Mapping[str, str] | None = None,
-                   weighting: str | None = None, normals: str = "auto", depth: str = "z",
+                   weighting: str | None = None, normals: str = "auto", depth: str = "auto",
                    camera: Camera | None = None) -> Interpretation:
     """How the samples under a header are to be read; parameters and errors as for path_samples.SampleReader."""
     if weighting is not None and weighting not in WEIGHTINGS:

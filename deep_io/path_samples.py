@@ -69,7 +69,7 @@ class SampleReader:
     """
 
     def __init__(self, path: PathLike, part: int | str | None = None, overrides: Mapping[str, str] | None = None,
-                 weighting: str | None = None, normals: str = "auto", depth: str = "z",
+                 weighting: str | None = None, normals: str = "auto", depth: str = "auto",
                  camera: Camera | str | None = None, threads: int | None = None) -> None:
         self._reader = DeepReader(path, part, threads)
         try:

@@ -43,11 +43,11 @@ def _note_debug(ctx: click.Context, parameter: click.Parameter | None, value: bo
 class LbmcOption(click.Option):
     """An option that LBMC_<COMMAND>_<OPTION>, or LBMC_<OPTION> for all commands at once, can stand in for.
 
-    The name is the flag's own: LBMC_NO_ADAPT=1 for --no-adapt.
+    The name is that of the first flag: LBMC_NO_ADAPT=1 for --no-adapt.
     """
 
     def resolve_envvar_value(self, ctx: click.Context) -> str | None:
-        flag = max(self.opts, key=len).lstrip("-").replace("-", "_").upper()
+        flag = next(name for name in self.opts if name.startswith("--")).lstrip("-").replace("-", "_").upper()
         contexts = (ctx, ctx.find_root())
         names = (f"{context.auto_envvar_prefix}_{flag}" for context in contexts if context.auto_envvar_prefix)
         return next((os.environ[name] for name in names if os.environ.get(name)), None)
@@ -140,8 +140,8 @@ mapping_options = together(
     ),
     option(
         "--depth",
-        type=click.Choice(["z", "distance"]),
-        default="z",
+        type=click.Choice(["auto", "z", "distance"]),
+        default="auto",
         show_default=True,
         help="Planar depth, or distance along the ray.",
     ),

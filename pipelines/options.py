@@ -17,7 +17,7 @@ ALL_LAYERS = 5
 Existing = Literal["refuse", "overwrite", "skip"]
 WeightingName = Literal["uniform", "packed", "over"]
 NormalSpace = Literal["auto", "world", "view"]
-DepthKind = Literal["z", "distance"]
+DepthKind = Literal["auto", "z", "distance"]
 PixelType = Literal["half", "float"]
 Precision = Literal["auto", "fp32", "bf16", "fp16"]
 
@@ -52,10 +52,10 @@ class DenoiseOptions:
     """How samples are weighted. None: by the header attribute, else uniform as long as every alpha is 0 or 1."""
     normals: NormalSpace = "auto"
     """Space of the normals. `world` needs `camera` or the header's worldToCamera."""
-    depth: DepthKind = "z"
-    """`z`: planar camera-space depth; `distance`: distance along the ray, which needs the camera's field of view."""
+    depth: DepthKind = "auto"
+    """`z`: planar; `distance`: along the ray, which needs the camera's field of view; `auto`: by header or table."""
     camera: str | None = None
-    """File that carries the camera (an EXR with worldToCamera, or 16 numbers, row-major, as text)."""
+    """An EXR, JSON or text file with the camera, or its field of view in degrees: `deep_io.camera.parse_camera`."""
 
     model: str | None = None
     """Name of a preset or path of a .safetensors file. None: the zoo's default preset."""
@@ -88,7 +88,7 @@ class DenoiseOptions:
     ids: tuple[str, ...] = ()
     """Id channels, written as ranked pairs of id and weight, not filtered."""
     keep: tuple[str, ...] = ()
-    """Other channels of the input to keep, as weighted pixel means: names, layers (`diffuse`) or globs (`light_*`)."""
+    """Other channels of the input to keep, as plain pixel means: names, layers (`diffuse`) or globs (`light_*`)."""
 
     progress: ProgressKind = "auto"
     """Where progress goes: see `pipelines.progress`."""

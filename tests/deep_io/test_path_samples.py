@@ -246,6 +246,11 @@ def test_the_depth_option_says_that_a_plain_z_is_a_ray_length(file):
     assert read(path).roles["depth"][0, 0] == 10
 
 
+def test_the_depth_option_says_that_a_layer_of_ray_lengths_is_planar(file):
+    path = write(file, {**rgb(1), "distance": [10.0]}, attributes={"lbmc:depth": "distance"})
+    assert read(path, depth="z").roles["depth"][0, 0] == 10
+
+
 def test_zero_is_a_miss_in_the_depth_of_mitsuba(file):
     path = write(file, {**rgb(1, 1), "A": [1, 1], "dd.y.T": [0, 4]}, attributes={"generatedBy": "Mitsuba version 3.9"})
     assert read(path, camera="1e-3").coverage.tolist() == [0, 1]

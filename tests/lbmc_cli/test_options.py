@@ -85,6 +85,7 @@ def test_environment_variables_stand_in_for_flags(parsed: Any) -> None:
     assert parsed(env={"LBMC_OVERWRITE": "1"}).existing == "overwrite"
     assert not parsed(env={"LBMC_NO_ADAPT": "1"}).adapt
     assert parsed(env={"LBMC_NO_ADAPT": "0"}).adapt
+    assert parsed(env={"LBMC_KEEP": "albedo"}).keep == ("albedo",)
     assert parsed(env={"LBMC_MAP": "normal=Nw depth=Zc"}).overrides == {"normal": "Nw", "depth": "Zc"}
 
 
