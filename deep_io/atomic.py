@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
-from deep_io.errors import InputError, UsageError
+from deep_io.errors import InputError, OutputError, UsageError
 
 PathLike = str | os.PathLike[str]
 Existing = Literal["refuse", "overwrite", "skip"]
@@ -61,7 +61,7 @@ def atomic_output(target: PathLike) -> Iterator[Path]:
     On any exception, KeyboardInterrupt and whatever a signal handler raises included, the temporary file is removed
     and the target stays as it was. The name keeps the target's suffix, since libraries choose the format by it, and
     begins with a dot, so that no sequence pattern finds it. Permissions follow the umask, or the file replaced.
-    Raises InputError when the folder does not exist, OSError from the disk.
+    Raises InputError when the folder does not exist, OutputError in place of an OSError inside.
     """
     path = Path(target)
     _require_folder(path)
@@ -71,7 +71,10 @@ def atomic_output(target: PathLike) -> Iterator[Path]:
         with suppress(FileNotFoundError):
             os.chmod(temporary, path.stat().st_mode & 0o777)
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         with suppress(FileNotFoundError):
             temporary.unlink()
+        if isinstance(error, OSError):
+            reason = error.strerror or str(error).replace(str(temporary), str(path)).removeprefix(f"{path}: ")
+            raise OutputError(f"{path}: cannot be written: {reason}") from error
         raise

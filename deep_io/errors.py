@@ -19,6 +19,10 @@ class UsageError(LbmcError):
     exit_code = 2
 
 
+class OutputError(LbmcError):
+    """An output could not be written: the disk is full, a quota is used up, a folder went away."""
+
+
 class InputError(LbmcError):
     """An input file is unreadable, corrupt or not the kind of file the job needs."""
 

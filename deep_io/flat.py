@@ -174,7 +174,7 @@ def write_flat_parts(path: PathLike, images: Sequence[FlatImage], compression: s
     try:
         OpenEXR.File(parts).write(os.fspath(path))
     except RuntimeError as error:
-        raise OSError(f"{os.fspath(path)}: cannot be written: {error}") from error
+        raise OSError(f"{os.fspath(path)}: {error}") from error
     _set_attributes(path, images)
 
 

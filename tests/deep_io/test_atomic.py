@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from deep_io.atomic import atomic_output, output_action
-from deep_io.errors import InputError, UsageError
+from deep_io.errors import InputError, OutputError, UsageError
 
 
 def test_the_output_appears_at_the_end_with_the_permissions_of_the_umask(tmp_path):
@@ -52,6 +53,21 @@ def test_an_exception_removes_the_temporary_file_and_keeps_the_old_output(tmp_pa
         fail()
     assert target.read_bytes() == b"old"
     assert os.listdir(tmp_path) == ["out.exr"]
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_an_error_of_the_disk_names_the_output_and_not_the_temporary_file(tmp_path, named):
+    target = tmp_path / "out.exr"
+
+    def fail() -> None:
+        with atomic_output(target) as temporary:
+            temporary.write_bytes(b"half")
+            raise OSError(f"{temporary}: no space") if named else OSError(errno.ENOSPC, "no space")
+
+    with pytest.raises(OutputError) as caught:
+        fail()
+    assert str(caught.value) == f"{target}: cannot be written: no space"
+    assert os.listdir(tmp_path) == []
 
 
 def test_an_exception_before_anything_was_written_is_passed_on(tmp_path):
