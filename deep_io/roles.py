@@ -197,8 +197,9 @@ def map_roles(channel_names: Iterable[str], overrides: Mapping[str, str] | None 
             raise InputError(f"{source}: {both} both match the role {role!r}; choose one with --map {role}=LAYER")
         found[role] = candidates[0]
     if "radiance" not in found:
+        there = ", ".join(layer or " ".join(components.values()) for layer, components in layers.items())
         raise InputError(f"{source}: no R, G, B channels; name the layer with the beauty by --map radiance=LAYER "
-                         f"(layers: {', '.join(layer or 'RGB' for layer in layers)})")
+                         f"(there are {there})")
     if "coverage" not in wanted:
         alpha = layers.get(found["radiance"].layer, {}).get(3)
         if alpha is not None and "coverage" in found:

@@ -137,6 +137,11 @@ def test_no_rgb_is_an_error_that_says_how_to_choose(names):
         map_roles(names, source="x.exr")
 
 
+def test_an_incomplete_beauty_is_listed_by_what_it_has():
+    with pytest.raises(InputError, match=r"there are R G, albedo\)"):
+        map_roles(["R", "G", "albedo.R", "albedo.G", "albedo.B"])
+
+
 def test_uint_radiance_is_an_error():
     dtypes = {name: np.dtype(np.float16) for name in "RGB"} | {"G": np.dtype(np.uint32)}
     with pytest.raises(InputError, match="'G' is uint"):
