@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_io.csr import pixels_of
 from deep_io.header import Header, read_headers
 from deep_io.path_samples import PathSamples, SampleReader
 from pipelines.options import DepthKind, NormalSpace, WeightingName
@@ -61,15 +62,17 @@ class SampleStatistics:
     repairs: Counter[str] = field(default_factory=Counter)
 
     def add(self, block: PathSamples) -> None:
-        counts = block.counts.reshape(-1, 1)
+        """Takes in a block; the virtual misses that decoding adds behind `over` are no samples of the file."""
+        stored = np.ones(block.total, np.bool_) if block.source is None else block.source >= 0
+        counts = np.bincount(pixels_of(block.counts)[stored], minlength=block.counts.size)
         self.pixels += counts.size
         self.empty_pixels += int(np.count_nonzero(counts == 0))
-        self.samples += len(block.coverage)
-        self.per_pixel.add(counts)
-        hit = block.coverage > 0
-        self.misses += int(np.count_nonzero(~hit))
+        self.samples += int(counts.sum())
+        self.per_pixel.add(counts[:, None])
+        hit = stored & (block.coverage > 0)
+        self.misses += int(np.count_nonzero(stored & ~hit))
         for role, values in {"coverage": block.coverage[:, None], **block.roles}.items():
-            self.roles.setdefault(role, Range()).add(values[hit] if role in FIRST_HIT_ROLES else values)
+            self.roles.setdefault(role, Range()).add(values[hit if role in FIRST_HIT_ROLES else stored])
         self.repairs.update(block.repairs)
 
     def as_dict(self) -> dict[str, Any]:
@@ -148,7 +151,7 @@ def file_info(
     overrides: Mapping[str, str] | None = None,
     weighting: WeightingName | None = None,
     normals: NormalSpace = "auto",
-    depth: DepthKind = "z",
+    depth: DepthKind = "auto",
     camera: str | None = None,
 ) -> FileInfo:
     """Reads all of one deep sample file, as a denoising job would, and says what is in it.

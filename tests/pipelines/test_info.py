@@ -53,6 +53,15 @@ def test_samples_pixels_and_misses_are_counted(small: Path) -> None:
     assert found["weighting"] == "uniform"
 
 
+def test_only_what_the_file_stores_is_counted_under_over(tmp_path: Path) -> None:
+    channels = {"R": [1, 1, 2], "G": [1, 1, 2], "B": [1, 1, 2], "A": [0.5, 0.5, 0.5], "Z": [1, 2, 3]}
+    path = write(tmp_path / "over.exr", [[2, 0], [1, 0]], channels, lbmc__weighting="over")
+    found = file_info(path).as_dict()
+    assert (found["pixels"], found["empty_pixels"], found["samples"], found["misses"]) == (4, 2, 3, 0)
+    assert found["samples_per_pixel"] == {"min": [0], "mean": [0.75], "max": [2]}
+    assert found["roles"]["coverage"]["min"] == [1]
+
+
 def test_first_hit_roles_leave_misses_out_and_radiance_keeps_them(small: Path) -> None:
     roles = file_info(small).as_dict()["roles"]
     assert roles["radiance"] == {"min": [1, 0, 0.5], "mean": [3, 0, 0.5], "max": [5, 0, 0.5]}
@@ -95,7 +104,7 @@ def test_fractional_alpha_without_a_weighting_is_refused(tmp_path: Path) -> None
     with pytest.raises(InputError, match="--weighting"):
         file_info(path)
     assert file_info(path, weighting="over").weighting == "over"
-    assert file_info(path, weighting="over").as_dict()["samples"] == 2  # with the virtual miss behind it
+    assert file_info(path, weighting="over").as_dict()["samples"] == 1  # without the virtual miss behind it
 
 
 def test_the_headers_weighting_is_followed(tmp_path: Path) -> None:
