@@ -57,7 +57,7 @@ class PackOptions:
     overrides: Mapping[str, str] = field(default_factory=dict)
     layers: tuple[str, ...] = ()
     normals: str = "auto"
-    depth: str = "z"
+    depth: str = "auto"
     camera: Camera | str | None = None
     pixel_type: str = "half"
     compression: str = "zips"
@@ -89,7 +89,8 @@ class PackReport:
 
     def lines(self) -> list[str]:
         """The report as text."""
-        mended = [f"{count} samples without finite {role}" for role, count in sorted(self.repairs.items()) if count]
+        mended = [f"{self.target}: {count} samples without finite {role}"
+                  for role, count in sorted(self.repairs.items()) if count]
         return [f"{self.target}: {self.samples} samples per pixel", *self.mapping.lines(), *self.notes, *mended]
 
 
@@ -141,12 +142,16 @@ def pack_frames(jobs: Sequence[PackJob], options: PackOptions | None = None, pro
     for job in jobs:
         output_action(job.target, every_source, options.existing)
 
+    told: set[str] = set()
+
     def work(job: PackJob, voice: Progress) -> PackReport:
         report = pack(job.sources, job.target, options, voice)
         if report is None:
             raise FrameSkippedError(f"{job.target} exists")
         for line in report.lines():
-            voice.note(line)
+            if line not in told:  # The frames of a sequence are alike: the mapping is said once.
+                told.add(line)
+                voice.note(line)
         return report
 
     with make_progress(progress, len(jobs)) as voice:

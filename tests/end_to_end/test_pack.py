@@ -76,7 +76,8 @@ def test_sequences_by_seed(tmp_path: Path) -> None:
     run = in_process(*words)
     assert run.code == 0, run.err
     assert sorted(path.name for path in tmp_path.glob("deep*")) == ["deep.0001.exr", "deep.0002.exr"]
-    assert "filter box" in run.err
+    assert run.err.count("filter box") == 1
+    assert run.err.count("3 samples per pixel") == 2
 
 
 def test_the_same_seed_twice_is_refused(lbmc: Runner, renders: list[Path], tmp_path: Path) -> None:
