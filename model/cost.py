@@ -148,7 +148,7 @@ def _affinity(config: Config) -> list[Stage]:
         Stage("splat", sample_layer=GUIDED_COLUMNS - 2 + config.embedding + 1),
         Stage("generator", parameters + config.partition_logits * hidden, pixel=pixel, layer=layer),
         Stage("guides", guides, layer=guides),
-        Stage("filter", layer=taps * (config.affinity_features + planes) + by_divisor),
+        Stage("filter", layer=taps * (config.affinity_features + 1 + planes) + by_divisor),
     ]
 
 
