@@ -40,6 +40,7 @@ from pipelines.tiles import DEFAULT_MEMORY, Band, memory_needed, plan_bands
 
 KEEP_BLOCK_BYTES = 64 << 20
 FEW_MIXED = 0.002  # of the pixels; already where depth mixes in 2 %, at the edges alone, one layer costs 6 % relMSE
+_OTHER_VERSION = "--model {}: holds a network of another version of lbmc; train it again, or use that version"
 SURVEY_SHARE = 0.15  # of a frame's progress
 MODEL_ATTRIBUTE, WEIGHTS_ATTRIBUTE, VERSION_ATTRIBUTE = "lbmc:model", "lbmc:weights", "lbmc:version"
 
@@ -103,7 +104,7 @@ class Job:
         self.device = choose_device(options.device)
         if options.threads is not None:
             torch.set_num_threads(options.threads)
-        self.net: Denoiser = self.weights.load().to(self.device)
+        self.net: Denoiser = load_network(self.weights).to(self.device)
         self.net.set_product_dtype(product_dtype(options.precision, self.device))
         self.memory = options.memory or DEFAULT_MEMORY
         if options.layers is not None and options.layers > self.net.config.partition_logits:
@@ -146,6 +147,8 @@ class Job:
                 update(SURVEY_SHARE * rows / window.height)
 
         seen = survey(counted())
+        if seen.samples == 0:
+            raise InputError(f"{source}: no sample has a finite radiance; render the frame again")
         if self.shot is None:
             self.shot = self._decide(source, seen, reader.weighting)
         if reader.weighting != self.shot.weighting:
@@ -303,6 +306,16 @@ def find_weights(name: str | None) -> zoo.Weights:
         return zoo.find(name)
     except ValueError as error:
         raise UsageError(f"--model: {error}") from None
+    except (KeyError, TypeError) as error:  # a config with other fields than ours
+        raise UsageError(_OTHER_VERSION.format(name)) from error
+
+
+def load_network(weights: zoo.Weights) -> Denoiser:
+    """The network of a weight file. Raises UsageError where its tensors are not those of this lbmc's networks."""
+    try:
+        return weights.load()
+    except RuntimeError as error:
+        raise UsageError(_OTHER_VERSION.format(weights.path)) from error
 
 
 def choose_device(name: str) -> torch.device:

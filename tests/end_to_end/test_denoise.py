@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -12,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 from deep_io import Window
 from pipelines import __version__
@@ -159,6 +162,15 @@ def test_broken_samples_are_left_out_and_counted(weights: Path, tmp_path: Path) 
     assert np.isfinite(rgb(tmp_path / "out.exr")).all()
 
 
+def test_a_frame_of_nothing_but_broken_samples_fails_and_is_not_written_black(weights: Path, tmp_path: Path) -> None:
+    samples = noisy_scene(0, TINY)
+    source = write_scene(tmp_path / "in.exr", changed(samples, R=np.full_like(samples.channels["R"], np.nan)))
+    run = in_process("denoise", source, tmp_path / "out.exr", "--model", weights)
+    assert run.code == 3
+    assert "in.exr: no sample has a finite radiance" in run.err
+    assert list(tmp_path.iterdir()) == [source]
+
+
 def test_values_beyond_half_are_clamped_counted_and_said(weights: Path, tmp_path: Path) -> None:
     samples = noisy_scene(5, TINY, dtype=np.float32)
     bright = {name: samples.channels[name] * np.float32(1e7) for name in "RGB"}
@@ -184,6 +196,21 @@ def test_a_gpu_that_is_not_there_is_a_usage_error(weights: Path, tmp_path: Path)
     run = in_process("denoise", source, tmp_path / "out.exr", "--model", weights, "--device", "cuda:63")
     assert run.code == 2
     assert "cuda:63" in run.err
+
+
+def test_weights_of_another_version_are_a_usage_error(weights: Path, tmp_path: Path) -> None:
+    source = write_scene(tmp_path / "in.exr")
+    with safe_open(weights, "pt") as file:
+        metadata, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}
+    name, tensor = next(iter(tensors.items()))
+    save_file({**tensors, name: tensor.repeat(2, *[1] * (tensor.ndim - 1))}, tmp_path / "wider.safetensors", metadata)
+    document = json.loads(metadata["lbmc"])
+    document["config"]["unheard_of"] = 1
+    save_file(tensors, tmp_path / "fields.safetensors", {"lbmc": json.dumps(document)})
+    for stem in ("wider", "fields"):
+        run = in_process("denoise", source, tmp_path / "out.exr", "--model", tmp_path / f"{stem}.safetensors")
+        assert run.code == 2
+        assert re.fullmatch(rf"ERROR: --model .*{stem}.safetensors: .*another version of lbmc.*\n", run.err)
 
 
 def test_openjd_progress_goes_to_standard_output(weights: Path, tmp_path: Path) -> None:
