@@ -47,11 +47,15 @@ class Weights:
         return hashlib.sha256(self.path.read_bytes()).hexdigest()[:12]
 
     def load(self) -> Denoiser:
-        """The network in float32, in evaluation mode."""
+        """The network in float32, in evaluation mode. Raises ValueError where the tensors do not fit the config."""
         net = Denoiser(self.config)
         with safe_open(self.path, "pt") as file:
             state = {key: file.get_tensor(key).float() for key in file.keys()}
-        net.load_state_dict(state)
+        try:
+            net.load_state_dict(state)
+        except RuntimeError:
+            raise ValueError(f"{self.path}: its weights are of another version of lbmc's network; train it again or "
+                             f"use the lbmc that wrote it") from None
         return net.eval()
 
 

@@ -45,6 +45,15 @@ def test_what_is_not_ours_is_refused_by_name(tmp_path: Path) -> None:
         zoo.find(str(foreign))
 
 
+def test_weights_of_another_network_are_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "old.safetensors"
+    net = random_network(SMALL["fast"], 1, torch.float32)
+    del net.generator
+    zoo.save(net, path, {})
+    with pytest.raises(ValueError, match=r"old\.safetensors: its weights are of another version"):
+        zoo.find(str(path)).load()
+
+
 def test_every_preset_that_ships_loads_and_is_small_enough() -> None:
     for weights in zoo.list_models():
         net = weights.load()
