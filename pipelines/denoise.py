@@ -318,14 +318,6 @@ def load_network(weights: zoo.Weights) -> Denoiser:
         raise UsageError(_OTHER_VERSION.format(weights.path)) from error
 
 
-def load_network(weights: zoo.Weights) -> Denoiser:
-    """The network of a weight file. Raises UsageError where the file does not fit this lbmc."""
-    try:
-        return weights.load()
-    except ValueError as error:
-        raise UsageError(f"--model: {error}") from None
-
-
 def choose_device(name: str) -> torch.device:
     """auto: the first GPU if there is one. Raises UsageError where CUDA is asked for and absent."""
     if name == "auto":
