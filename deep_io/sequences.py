@@ -88,12 +88,20 @@ def expand(source: PathLike, frames: str | None = None) -> list[Frame]:
     return found
 
 
+def require_exr(target: PathLike) -> None:
+    """Raises UsageError for an output whose name promises another format than the EXR that will be in it."""
+    if Path(target).suffix.lower() != ".exr":
+        raise UsageError(f"{os.fspath(target)}: an EXR is written; give it a name that ends in .exr")
+
+
 def pair(source: PathLike, target: PathLike, frames: str | None = None) -> list[Frame]:
     """The frames of an input, each with the file that it writes.
 
-    Raises InputError when one of `source` and `target` is a sequence and the other a single file, and what `expand`
-    raises.
+    Raises InputError when one of `source` and `target` is a sequence and the other a single file, and what
+    `require_exr` and `expand` raise.
     """
+    if not os.path.isdir(target):  # a folder is refused as one, with all outputs
+        require_exr(target)
     many = is_sequence(source)
     # An output of this very name may exist from a mistaken run; the pattern still says what is meant.
     many_out = has_pattern(target)

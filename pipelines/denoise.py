@@ -10,7 +10,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,6 @@ from pipelines.tiles import DEFAULT_MEMORY, Band, memory_needed, plan_bands
 
 KEEP_BLOCK_BYTES = 64 << 20
 FEW_MIXED = 0.002  # of the pixels; already where depth mixes in 2 %, at the edges alone, one layer costs 6 % relMSE
-_OTHER_VERSION = "--model {}: holds a network of another version of lbmc; train it again, or use that version"
 SURVEY_SHARE = 0.15  # of a frame's progress
 MODEL_ATTRIBUTE, WEIGHTS_ATTRIBUTE, VERSION_ATTRIBUTE = "lbmc:model", "lbmc:weights", "lbmc:version"
 
@@ -292,14 +291,6 @@ def run_job(kind: type[Job], options: DenoiseOptions) -> JobReport[DenoisedFrame
         return run_frames(frames, job.frame, progress, str)
 
 
-def denoise_file(source: str | os.PathLike[str], options: DenoiseOptions) -> FrameLayers:
-    """The layers of one file in memory, for other pipelines and for scripts; nothing is written."""
-    job = Job(replace(options, source=os.fspath(source)))
-    with job.open(Path(source)) as reader:
-        plan = job.plan(Path(source), reader, lambda _: None)
-        return denoise_bands(reader, job.net, plan.shot.scale, plan.roles, plan.shot.layers, plan.bands)
-
-
 def find_weights(name: str | None) -> zoo.Weights:
     """A preset or weight file. Raises UsageError."""
     try:
@@ -307,15 +298,16 @@ def find_weights(name: str | None) -> zoo.Weights:
     except ValueError as error:
         raise UsageError(f"--model: {error}") from None
     except (KeyError, TypeError) as error:  # a config with other fields than ours
-        raise UsageError(_OTHER_VERSION.format(name)) from error
+        raise UsageError(f"--model: {name}: its config is of another version of lbmc's network; train it again or use "
+                         f"the lbmc that wrote it") from error
 
 
 def load_network(weights: zoo.Weights) -> Denoiser:
     """The network of a weight file. Raises UsageError where its tensors are not those of this lbmc's networks."""
     try:
         return weights.load()
-    except RuntimeError as error:
-        raise UsageError(_OTHER_VERSION.format(weights.path)) from error
+    except ValueError as error:
+        raise UsageError(f"--model: {error}") from error
 
 
 def choose_device(name: str) -> torch.device:

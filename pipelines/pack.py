@@ -26,7 +26,7 @@ from deep_io.flat import HALF_MAX, kept_attributes, to_half
 from deep_io.header import Header, channels_of
 from deep_io.roles import MISS_DEPTH, ROLES, RoleMap
 from deep_io.samples import DeepSamples
-from deep_io.sequences import expand, frame_path, has_pattern, is_sequence, parse_frames, substitute
+from deep_io.sequences import expand, frame_path, has_pattern, is_sequence, parse_frames, require_exr, substitute
 from deep_io.weighting import ATTRIBUTE, Packed, encode_packed
 from pipelines import __version__
 from pipelines.flat_renders import RenderStack, read_renders
@@ -104,6 +104,7 @@ def plan(sources: Sequence[PathLike], target: PathLike, seeds: str | None = None
     Raises InputError for files or frames that are missing and when only one of sources and target is a sequence,
     UsageError for options that contradict.
     """
+    require_exr(target)
     patterns = [os.fspath(source) for source in sources]
     if seeds is not None:
         if len(patterns) != 1:

@@ -101,6 +101,15 @@ def test_a_frame_that_fails_does_not_stop_the_others_and_is_listed_at_the_end(we
     assert "2 of 3 frames done, 1 failed" in run.err
 
 
+def test_an_output_that_is_not_named_as_an_exr_is_refused(weights: Path, tmp_path: Path) -> None:
+    source = write_scene(tmp_path / "in.exr")
+    for words in (["denoise", "--model", weights], ["pack"]):
+        run = in_process(*words, source, tmp_path / "out.jpg")
+        assert run.code == 2
+        assert "ends in .exr" in run.err
+    assert list(tmp_path.iterdir()) == [source]
+
+
 def test_a_resumed_sequence_gives_the_bytes_of_one_that_was_never_stopped(weights: Path, tmp_path: Path) -> None:
     for number in (1, 2, 3):
         scene = noisy_scene(number, TINY)
@@ -210,7 +219,7 @@ def test_weights_of_another_version_are_a_usage_error(weights: Path, tmp_path: P
     for stem in ("wider", "fields"):
         run = in_process("denoise", source, tmp_path / "out.exr", "--model", tmp_path / f"{stem}.safetensors")
         assert run.code == 2
-        assert re.fullmatch(rf"ERROR: --model .*{stem}.safetensors: .*another version of lbmc.*\n", run.err)
+        assert re.fullmatch(rf"ERROR: --model: .*{stem}.safetensors: .*another version of lbmc.*\n", run.err)
 
 
 def test_openjd_progress_goes_to_standard_output(weights: Path, tmp_path: Path) -> None:
