@@ -27,7 +27,6 @@ _ARRAYS = {"floatvector": "<f4"}
 COMPRESSIONS = ("none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab", "htj2k256", "htj2k32",
                 "lj2k", "zstd")
 LINE_ORDERS = ("increasing", "decreasing", "random")
-DEEP_IMAGE_STATES = ("messy", "sorted", "non_overlapping", "tidy")
 
 
 def _strings(data: bytes) -> list[str]:

@@ -194,7 +194,6 @@ def _stack(mapping: RoleMap, role: str, channels: dict[str, NDArray[np.generic]]
     shared = {name for other, source in mapping.sources.items() if other != role for name in source.channels}
     stacked = np.empty((channels[names[0]].size, len(names)), np.float32)
     for index, name in enumerate(names):
-        # A double-width or integer value beyond float32 becomes Inf and is mended like any other.
         stacked[:, index] = channels[name] if name in shared else channels.pop(name)
     return stacked
 

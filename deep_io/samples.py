@@ -12,6 +12,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_io.csr import offsets_of, pixels_of
+
 
 @dataclass(frozen=True)
 class Window:
@@ -68,14 +70,12 @@ class DeepSamples:
     @property
     def offsets(self) -> NDArray[np.int64]:
         """(H*W+1,) where each pixel's samples begin; pixel p owns the slice offsets[p]:offsets[p+1]."""
-        offsets = np.zeros(self.counts.size + 1, np.int64)
-        np.cumsum(self.counts, dtype=np.int64, out=offsets[1:])
-        return offsets
+        return offsets_of(self.counts)
 
     @property
     def pixel_index(self) -> NDArray[np.int64]:
         """(N,) the flat pixel number (row * W + column) of each sample."""
-        return np.repeat(np.arange(self.counts.size, dtype=np.int64), self.counts.ravel())
+        return pixels_of(self.counts)
 
 
 def concatenate(blocks: list[DeepSamples]) -> DeepSamples:

@@ -19,8 +19,8 @@ from deep_io.header import Header, read_headers
 from deep_io.path_samples import PathSamples, SampleReader
 from pipelines.options import DepthKind, NormalSpace, WeightingName
 
-FIRST_HIT_ROLES = ("depth", "normal", "albedo", "specular", "roughness", "motion", "coc")
-"""Roles that a miss does not have: their statistics are over samples that hit something."""
+ROLES_OF_A_MISS = ("radiance", "coverage")
+"""What a miss has too; the statistics of the other roles are over samples that hit something."""
 
 
 @dataclass
@@ -72,7 +72,7 @@ class SampleStatistics:
         hit = stored & (block.coverage > 0)
         self.misses += int(np.count_nonzero(stored & ~hit))
         for role, values in {"coverage": block.coverage[:, None], **block.roles}.items():
-            self.roles.setdefault(role, Range()).add(values[hit if role in FIRST_HIT_ROLES else stored])
+            self.roles.setdefault(role, Range()).add(values[stored if role in ROLES_OF_A_MISS else hit])
         self.repairs.update(block.repairs)
 
     def as_dict(self) -> dict[str, Any]:

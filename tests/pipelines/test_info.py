@@ -40,6 +40,7 @@ def small(tmp_path: Path) -> Path:
             "A": [1, 1, 1, 1, 0, 1],
             "Z": [1, 2, 3, 4, 1e10, 6],
             "roughness": [0.25, 0.5, 1, 1, 0, 1],
+            "time": [0.5, 0.5, 1, 1, 0.25, 1],
         },
         owner="somebody",
     )
@@ -66,6 +67,7 @@ def test_first_hit_roles_leave_misses_out_and_radiance_keeps_them(small: Path) -
     roles = file_info(small).as_dict()["roles"]
     assert roles["radiance"] == {"min": [1, 0, 0.5], "mean": [3, 0, 0.5], "max": [5, 0, 0.5]}
     assert roles["depth"] == {"min": [1], "mean": [2.5], "max": [4]}
+    assert roles["time"] == {"min": [0.5], "mean": [0.75], "max": [1]}
     assert roles["roughness"] == {"min": [0.25], "mean": [0.6875], "max": [1]}
 
 
