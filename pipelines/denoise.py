@@ -32,7 +32,7 @@ from pipelines.aovs import Aovs, beauty_channels, find_aovs
 from pipelines.ids import IdChannel, find_ids, ranked_ids
 from pipelines.inference import FrameLayers, denoise_bands
 from pipelines.jobs import FrameSkippedError, JobReport, run_frames
-from pipelines.keep import kept_channels
+from pipelines.keep import find_kept, kept_channels
 from pipelines.options import DenoiseOptions
 from pipelines.progress import Progress, make_progress
 from pipelines.survey import Survey, survey
@@ -66,6 +66,7 @@ class FramePlan:
     mapping: list[str]
     aovs: Aovs = field(default_factory=Aovs)
     ids: Sequence[IdChannel] = ()
+    kept: Sequence[str] = ()
 
     def lines(self) -> list[str]:
         """The plan, for `--dry-run`."""
@@ -79,6 +80,7 @@ class FramePlan:
             f"layers: {self.shot.layers}",
             *([] if seen.mixed is None else [f"depth mixes in {seen.mixed:.1%} of the pixels"]),
             *(f"AOV: {', '.join(group.outputs)} filtered as {group.kind}" for group in self.aovs.groups),
+            *([f"kept as pixel means: {' '.join(self.kept)}"] if self.kept else []),
             *(f"ids: {one.channel} ranked as {one.base}" for one in self.ids),
             f"bands: {len(self.bands)}, about {self.memory / 2**20:.0f} MiB",
         ]
@@ -135,6 +137,7 @@ class Job:
         window = reader.header.data_window
         aovs = find_aovs(self.options.aovs, reader.header, reader.mapping, os.fspath(source))
         ids = find_ids(self.options.ids, reader.header, os.fspath(source))
+        kept = find_kept(reader.header, reader.weighting, self.options.keep, os.fspath(source))
         reader.carry(aovs.channels("light"), aovs.channels("data"))
         rows = 0
 
@@ -161,7 +164,7 @@ class Job:
                            reader.carried)
         tallest = max(band.read1 - band.read0 for band in bands)
         needed = memory_needed(tallest, window.width, per_pixel, reader.carried)
-        return FramePlan(source, seen, self.shot, roles, bands, needed, reader.mapping.lines(), aovs, ids)
+        return FramePlan(source, seen, self.shot, roles, bands, needed, reader.mapping.lines(), aovs, ids, kept)
 
     def _decide(self, source: Path, seen: Survey, weighting: str) -> Shot:
         """The shot's scale, both numbers of it, comes from one frame: chunks of a shot that name it agree exactly."""

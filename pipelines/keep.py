@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from deep_io.deep_reader import DeepReader
 from deep_io.errors import InputError, UsageError
+from deep_io.header import Header
 from deep_io.samples import DeepSamples
 
 WRITTEN = ("R", "G", "B", "A")  # the beauty's own channels
@@ -31,21 +32,33 @@ def matching_channels(names: Sequence[str], wanted: Sequence[str], source: str) 
     return found
 
 
+def find_kept(header: Header, weighting: str, wanted: Sequence[str], source: str) -> list[str]:
+    """The names of the channels asked for, checked before any work is done.
+
+    Raises InputError for a request that matches nothing or an id (an average of ids is no id), UsageError unless every
+    sample weighs the same.
+    """
+    if not wanted:
+        return []
+    if weighting != "uniform":
+        raise UsageError(f"{source}: --keep averages samples of equal weight, these are weighted {weighting}")
+    names = matching_channels(header.channel_names, wanted, source)
+    ids = [channel.name for channel in header.channels if channel.name in names and channel.dtype.kind == "u"]
+    if ids:
+        raise InputError(f"{source}: channel {ids[0]} holds ids, which cannot be averaged; leave it out of --keep")
+    return names
+
+
 def kept_channels(
     path: str, part: int | str | None, weighting: str, wanted: Sequence[str], max_bytes: int
 ) -> dict[str, npt.NDArray[Any]]:
     """Pixel means (H, W), in the file's type, of the channels asked for; 0 where a pixel has no finite value.
 
-    Raises InputError for ids (an average of ids is no id), UsageError unless every sample weighs the same.
+    Raises what `find_kept` does.
     """
-    if weighting != "uniform":
-        raise UsageError(f"{path}: --keep averages samples of equal weight, these are weighted {weighting}")
     with DeepReader(path, part) as reader:
         channels = {channel.name: channel.dtype for channel in reader.header.channels}
-        names = matching_channels(list(channels), wanted, path)
-        ids = [name for name in names if channels[name].kind == "u"]
-        if ids:
-            raise InputError(f"{path}: channel {ids[0]} holds ids, which cannot be averaged; leave it out of --keep")
+        names = find_kept(reader.header, weighting, wanted, path)
         window = reader.header.data_window
         out = {name: np.zeros((window.height, window.width), channels[name]) for name in names}
         for block in reader.blocks(max_bytes, names):

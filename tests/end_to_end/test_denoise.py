@@ -180,6 +180,26 @@ def test_a_frame_of_nothing_but_broken_samples_fails_and_is_not_written_black(we
     assert list(tmp_path.iterdir()) == [source]
 
 
+def test_kept_channels_are_the_pixel_means_of_their_finite_values(weights: Path, tmp_path: Path) -> None:
+    samples = noisy_scene(0, TINY)
+    lens = samples.channels["lens.X"].copy()
+    lens[::7] = np.nan
+    source = write_scene(tmp_path / "in.exr", changed(samples, lens__X=lens))
+    words = ("--model", weights, "--keep", "lens", "--keep", "c?c")
+    assert in_process("denoise", source, tmp_path / "out.exr", *words).code == 0
+    channels, _ = read_flat(tmp_path / "out.exr")
+    assert set(channels) == {"R", "G", "B", "A", "lens.X", "lens.Y", "coc"}
+    for name, values in {**samples.channels, "lens.X": lens}.items():
+        if name not in ("lens.X", "lens.Y", "coc"):
+            continue
+        finite = np.isfinite(values)
+        sums = np.bincount(samples.pixel_index[finite], values[finite].astype(np.float64), samples.counts.size)
+        counts = np.bincount(samples.pixel_index[finite], minlength=samples.counts.size)
+        expected = (sums / np.maximum(counts, 1)).reshape(samples.counts.shape)
+        assert channels[name].dtype == np.float16
+        np.testing.assert_allclose(channels[name], expected, rtol=1e-3, atol=1e-6)
+
+
 def test_values_beyond_half_are_clamped_counted_and_said(weights: Path, tmp_path: Path) -> None:
     samples = noisy_scene(5, TINY, dtype=np.float32)
     bright = {name: samples.channels[name] * np.float32(1e7) for name in "RGB"}
@@ -197,6 +217,11 @@ def test_a_dry_run_says_everything_and_writes_nothing(weights: Path, tmp_path: P
     assert list(tmp_path.iterdir()) == [source]
     for word in ("radiance   <- R G B", "weighting: uniform", "layers: ", "exposure: ", "MiB"):
         assert word in run.out
+    run = in_process("denoise", source, tmp_path / "out.exr", "--model", weights, "--dry-run", "--keep", "absent")
+    assert run.code == 3
+    assert "no channel or layer 'absent' to keep" in run.err
+    run = in_process("denoise", source, tmp_path / "out.exr", "--model", weights, "--dry-run", "--keep", "lens")
+    assert "kept as pixel means: lens.X lens.Y" in run.out
     assert run.out.startswith(f"{source} -> {tmp_path / 'out.exr'}\n")
 
 
