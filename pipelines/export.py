@@ -72,11 +72,16 @@ class ExportJob(Job):
         assert frame.target is not None
         if self.options.form != "files":
             return [frame.target]
-        layers = self.shot.layers if self.shot else self.options.layers or self.net.config.layers
-        return [layer_path(frame.target, layer) for layer in range(layers)]
+        return [layer_path(frame.target, layer) for layer in range(self.layers)]
+
+    @property
+    def layers(self) -> int:
+        """How many layers are written, whatever the survey finds that a frame needs: comps count on it."""
+        return self.options.layers or self.net.config.layers
 
     def write(self, frame: Frame, wanted: list[Path], plan: FramePlan, layers: FrameLayers, header: Header) -> int:
         """Writes the layers in the form asked for; returns how many values were clamped to half's range."""
+        layers = layers.padded(self.layers)
         if self.options.form == "deep":
             return self._write_deep(wanted[0], plan, layers, header)
         pictures, clamped = self._pictures(layers, ("R", "G", "B", *plan.aovs.outputs), "depth" in plan.roles)

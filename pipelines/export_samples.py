@@ -40,7 +40,8 @@ class SamplesJob(Job):
                 update: Callable[[float], None]) -> tuple[int, float]:
         """Band by band, so that a frame larger than memory passes too. Nothing is clamped, nothing timed apart."""
         options, layers = self.options, plan.shot.layers
-        names = [f"layer{layer}.weight" for layer in range(layers)]
+        count = max(options.layers or self.net.config.layers, layers)  # those the survey does without take nothing
+        names = [f"layer{layer}.weight" for layer in range(count)]
         dtype: np.dtype[Any] = np.dtype(np.float16 if options.pixel_type == "half" else np.float32)
         row_samples = reader.samples_per_row
         with (DeepReader(frame.source, options.part, options.threads) as raw, atomic_output(wanted[0]) as temporary,
@@ -51,6 +52,7 @@ class SamplesJob(Job):
                 block = reader.read(top + band.read0, top + band.read1)
                 samples = to_model(block, plan.roles, plan.shot.scale.depth, self.device)
                 shares = self.net.partition(samples, plan.shot.scale, layers).float().cpu().numpy()
+                shares = np.pad(shares, ((0, 0), (count - layers, 0)))
                 stored = stored_shares(block, shares, int(row_samples[band.read0 : band.read1].sum()))
                 first = int(row_samples[band.read0 : band.y0].sum())
                 deep = raw.read(top + band.y0, top + band.y1)

@@ -46,6 +46,17 @@ class FrameLayers:
         alpha: FloatArray = np.clip(self.coverage.sum(0), 0, 1)
         return alpha
 
+    def padded(self, count: int) -> FrameLayers:
+        """At least `count` layers: those that are absent are transparent ones in front."""
+        absent = max(count - len(self.weight), 0)
+
+        def pad(planes: FloatArray, value: float = 0.0) -> FloatArray:
+            front = np.full((absent, *planes.shape[1:]), value, np.float32)
+            return np.concatenate([front, planes]) if absent else planes
+
+        return FrameLayers(pad(self.color), pad(self.weight), pad(self.coverage), pad(self.depth, np.inf),
+                           pad(self.extra))
+
 
 def to_model(block: PathSamples, roles: tuple[str, ...], depth: float, device: torch.device, lights: int = 0
              ) -> Samples:

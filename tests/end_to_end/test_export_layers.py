@@ -19,7 +19,7 @@ from deep_io.roles import MISS_DEPTH
 from model import zoo
 from pipelines import __version__
 from tests.end_to_end.compositor import flatten, over, part_names, picture, plus
-from tests.end_to_end.scenes import noisy_scene, random_weights, read_flat, write_scene
+from tests.end_to_end.scenes import changed, noisy_scene, random_weights, read_flat, write_scene
 from tests.model.random_models import SMALL, random_network
 from tests.runner import Runner, in_process, installed
 
@@ -302,3 +302,20 @@ def test_a_dry_run_writes_nothing(weights: Weights, source: Path, tmp_path: Path
     assert run.code == 0
     assert "layers: 2" in run.out
     assert not list(tmp_path.iterdir())
+
+
+def test_a_frame_that_needs_one_layer_still_gives_the_files_that_a_comp_counts_on(tmp_path: Path) -> None:
+    samples = noisy_scene()
+    flat = changed(samples, Z=np.full(samples.total, 3, np.float32), A=np.ones(samples.total, np.float16))
+    source = write_scene(tmp_path / "in.deep.exr", flat)
+    weights = random_weights(tmp_path / "w.safetensors")
+    common = ["--model", str(weights), "--pixel-type", "float", "--progress", "none"]
+    result = in_process("export-layers", str(source), str(tmp_path / "out.exr"), "--form", "files",
+                        "--contributions", *common)
+    assert result.code == 0, result.err
+    assert in_process("denoise", str(source), str(tmp_path / "beauty.exr"), *common).code == 0
+    front, back = (read_flat(tmp_path / f"out.layer{k}.exr")[0] for k in range(2))
+    beauty = read_flat(tmp_path / "beauty.exr")[0]
+    assert not front["R"].any()
+    assert not front["A"].any()
+    np.testing.assert_allclose(back["R"], beauty["R"], rtol=1e-6)
