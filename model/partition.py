@@ -45,7 +45,7 @@ def relative_depth(samples: Samples, segments: Segments, scale: FrameScale) -> T
     """(N, 1): log depth against its neighbourhood, in spreads, - in front, + behind, +-PRIOR_LIMIT.
 
     (log z - mean) / (spread + PRIOR_SPREAD), mean and spread weighted over PRIOR_WINDOW pixels around the sample's
-    pixel. A miss is PRIOR_LIMIT behind wherever the neighbourhood has hits, and 0 where it has none.
+    pixel. A miss is PRIOR_LIMIT behind, also where nothing is in front of it: the sky is the background everywhere.
     """
     batch, height, width = samples.shape
     hit = (samples.coverage > 0)[:, None]
@@ -62,7 +62,7 @@ def relative_depth(samples: Samples, segments: Segments, scale: FrameScale) -> T
     spread = (second / safe - mean * mean).clamp_min(0).sqrt()
     around = segments.expand(torch.cat([mean, spread, some.to(mean.dtype)], 1))
     relative = ((zeta - around[:, :1]) / (around[:, 1:2] + PRIOR_SPREAD)).clamp(-PRIOR_LIMIT, PRIOR_LIMIT)
-    return torch.where(hit, relative, PRIOR_LIMIT) * around[:, 2:]
+    return torch.where(hit, relative * around[:, 2:], PRIOR_LIMIT)
 
 
 @dataclass

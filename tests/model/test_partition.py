@@ -108,7 +108,7 @@ def test_relative_depth_knows_front_from_back_whatever_the_unit() -> None:
     torch.testing.assert_close(again, relative)
 
 
-def test_relative_depth_is_zero_where_nothing_was_hit() -> None:
+def test_the_sky_is_behind_also_where_nothing_was_hit() -> None:
     samples = random_samples(3, (1, 3, 3), 2)
     samples.coverage[:] = 0
-    assert bool((relative_depth(samples, Segments(samples.counts), FrameScale()) == 0).all())
+    assert bool((relative_depth(samples, Segments(samples.counts), FrameScale()) == PRIOR_LIMIT).all())
