@@ -1,4 +1,4 @@
-"""What a frame is like, measured before it is denoised: exposure, depth scale, live roles, sample counts.
+"""What a frame is like, measured before it is denoised: exposure, depth scale, mixing of depths, sample counts.
 
 One pass over the file in blocks of rows, so a frame larger than memory is surveyed too.
 """
@@ -24,23 +24,18 @@ class Survey:
 
     exposure : 1 / radiance, see `exposure_of`
     depth : median over the pixels of their hits' mean depth, scene units; 1 without depth or hits
-    varying : roles whose values differ anywhere among the hits; the others are constant over the whole frame
-    pixels, empty_pixels, samples, hits : counts
+    pixels, empty_pixels, samples : counts
     mixed : share of the pixels in which depth mixes: hits further apart than MIXED_DEPTH, or hits and misses; None
         without depth
-    luminance : mean over pixels of the samples' mean radiance
     repairs : non-finite values that were mended, by role
     """
 
     exposure: float
     depth: float
-    varying: frozenset[str]
     pixels: int
     empty_pixels: int
     samples: int
-    hits: int
     mixed: float | None
-    luminance: float
     repairs: dict[str, int]
 
 
@@ -48,24 +43,14 @@ def survey(blocks: Iterable[PathSamples]) -> Survey:
     """Looks at every sample of a frame, given as blocks of whole rows from the top."""
     bins: dict[int, npt.NDArray[np.float64]] = {}
     areas: dict[int, npt.NDArray[np.float64]] = {}
-    ranges: dict[str, tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]] = {}
     depths: list[npt.NDArray[np.float64]] = []
     repairs: Counter[str] = Counter()
-    pixels = empty = samples = hits = mixed = 0
-    total = 0.0
+    pixels = empty = samples = mixed = 0
     top: int | None = None
     for block in blocks:
         top = block.window.ymin if top is None else top
         luminance = _pixel_luminance(block)
         _add_bins(bins, areas, luminance, block.window.ymin - top)
-        hit = block.coverage > 0
-        for role, values in block.roles.items():
-            live = values[hit]
-            if len(live):
-                low, high = live.min(0), live.max(0)
-                if role in ranges:
-                    low, high = np.minimum(low, ranges[role][0]), np.maximum(high, ranges[role][1])
-                ranges[role] = low, high
         if "depth" in block.roles:
             depths.append(pixel_depth(block))
             mixed += int(_mixes_depth(block).sum())
@@ -73,19 +58,14 @@ def survey(blocks: Iterable[PathSamples]) -> Survey:
         pixels += block.counts.size
         empty += int((block.counts == 0).sum())
         samples += len(block.weight)
-        hits += int(hit.sum())
-        total += float(luminance.sum())
     means = np.concatenate([bins[row] / areas[row] for row in sorted(bins)])
     return Survey(
         exposure=exposure_of_bins(means),
         depth=median_depth(depths),
-        varying=frozenset(role for role, (low, high) in ranges.items() if np.any(low != high)),
         pixels=pixels,
         empty_pixels=empty,
         samples=samples,
-        hits=hits,
         mixed=mixed / max(pixels, 1) if depths else None,
-        luminance=total / max(pixels, 1),
         repairs=dict(repairs),
     )
 

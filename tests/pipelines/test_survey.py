@@ -40,13 +40,11 @@ def scaled(block: PathSamples, radiance: float, depth: float) -> PathSamples:
     return PathSamples(block.counts, block.weight, block.coverage, roles, block.window)
 
 
-def test_counts_and_varying_roles() -> None:
+def test_counts_and_repairs() -> None:
     block = frame()
     seen = survey([block])
     assert (seen.pixels, seen.samples) == (block.counts.size, block.weight.size)
     assert seen.empty_pixels == int((block.counts == 0).sum())
-    assert seen.hits == int(block.coverage.sum())
-    assert seen.varying == {"radiance", "depth"}
     assert seen.repairs == {"depth": 2}
 
 
@@ -58,7 +56,7 @@ def test_blocks_change_nothing(cuts: list[int]) -> None:
     whole, cut = survey([block]), survey(parts)
     assert cut.exposure == pytest.approx(whole.exposure, rel=1e-12)
     assert cut.depth == pytest.approx(whole.depth, rel=1e-12)
-    assert (cut.samples, cut.hits, cut.varying) == (whole.samples, whole.hits, whole.varying)
+    assert (cut.samples, cut.mixed) == (whole.samples, whole.mixed)
 
 
 @pytest.mark.parametrize("factor", [1e-6, 0.37, 12345.0])
