@@ -12,6 +12,7 @@ import torch
 from deep_io.errors import UsageError
 from model import zoo
 from model.config import CONFIGS
+from pipelines.denoise import find_weights, load_network
 from pipelines.training.cache import SampleCache, build_cache
 from pipelines.training.loop import Trainer
 from pipelines.training.recipe import Recipe
@@ -50,7 +51,7 @@ def train(
     held_out = open_cache(validation, report)
     if len(training.entries) < FEWEST_SCENES:
         raise UsageError(f"{data}: {len(training.entries)} scene; training needs {FEWEST_SCENES} or more")
-    initial = zoo.find(str(start)).load().state_dict() if start is not None else None
+    initial = load_network(find_weights(str(start))).state_dict() if start is not None else None
     trainer = Trainer(CONFIGS[preset], recipe, folder, initial)
     report(f"{len(training.entries)} scenes, {len(held_out.entries)} held out, from step {trainer.step}")
     trainer.run(training, held_out, report, seconds)
