@@ -24,7 +24,6 @@ from deep_io.errors import InputError, LbmcError, UsageError
 from deep_io.flat import to_half, write_flat
 from deep_io.header import Header
 from deep_io.path_samples import SampleReader
-from model import zoo
 from model.denoiser import Denoiser
 from model.features import FrameScale
 from pipelines import __version__
@@ -33,6 +32,7 @@ from pipelines.ids import IdChannel, find_ids, ranked_ids
 from pipelines.inference import FrameLayers, denoise_bands
 from pipelines.jobs import FrameSkippedError, JobReport, run_frames
 from pipelines.keep import find_kept, kept_channels
+from pipelines.network import choose_device, find_weights, load_network, product_dtype
 from pipelines.options import DenoiseOptions
 from pipelines.progress import Progress, make_progress
 from pipelines.survey import Survey, survey
@@ -292,43 +292,6 @@ def run_job(kind: type[Job], options: DenoiseOptions) -> JobReport[DenoisedFrame
     progress = make_progress(options.progress, len(frames))
     with progress:
         return run_frames(frames, job.frame, progress, str)
-
-
-def find_weights(name: str | None) -> zoo.Weights:
-    """A preset or weight file. Raises UsageError."""
-    try:
-        return zoo.find(name)
-    except ValueError as error:
-        raise UsageError(f"--model: {error}") from None
-    except (KeyError, TypeError) as error:  # a config with other fields than ours
-        raise UsageError(f"--model: {name}: its config is of another version of lbmc's network; train it again or use "
-                         f"the lbmc that wrote it") from error
-
-
-def load_network(weights: zoo.Weights) -> Denoiser:
-    """The network of a weight file. Raises UsageError where its tensors are not those of this lbmc's networks."""
-    try:
-        return weights.load()
-    except ValueError as error:
-        raise UsageError(f"--model: {error}") from error
-
-
-def choose_device(name: str) -> torch.device:
-    """auto: the first GPU if there is one. Raises UsageError where CUDA is asked for and absent."""
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    device = torch.device(name)
-    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise UsageError(f"--device {name}: this machine shows {torch.cuda.device_count()} CUDA devices to PyTorch; "
-                         f"pass --device cpu, or install a CUDA build of torch")
-    return device
-
-
-def product_dtype(precision: str, device: torch.device) -> torch.dtype | None:
-    """The type of matrix products; None is float32. `auto`: bf16 on a GPU, float32 on a CPU."""
-    if precision == "auto":
-        return torch.bfloat16 if device.type == "cuda" else None
-    return {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}[precision]
 
 
 def to_pixel_type(values: npt.NDArray[np.float32], pixel_type: str) -> tuple[npt.NDArray[Any], int]:

@@ -12,7 +12,7 @@ import torch
 from deep_io.errors import UsageError
 from model import zoo
 from model.config import CONFIGS
-from pipelines.denoise import find_weights, load_network
+from pipelines.network import find_weights, load_network
 from pipelines.training.cache import SampleCache, build_cache
 from pipelines.training.loop import Trainer
 from pipelines.training.recipe import Recipe
