@@ -16,13 +16,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
+from itertools import groupby
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-BAND_ROWS = 64  # target rows filtered at a time at inference: the weights of all their taps stay near the caches
+ACTIVE_CELL = 64  # pixels; targets are filtered, or left out, in cells of this size at inference
 
 
 def pool_cells(log_n: Tensor, planes: Tensor, size: int) -> tuple[Tensor, Tensor]:
@@ -72,12 +73,14 @@ class _Level:
         self.log_spline = spline_logs(size, window, bias)
         self.wide = [self._widen(plane) for plane in (self.bias, self.features, self.values)]
 
-    def band(self, first: int, last: int) -> _Level:
-        """The same level with only the target rows first..last (exclusive), multiples of the level's size."""
+    def tile(self, image: int, rows: slice, cols: slice) -> _Level:
+        """The same level with only these targets of one image; rows and columns are multiples of the level's size."""
         part = copy(self)
-        part.rows = (last - first) // self.size
-        start = first // self.size
-        part.wide = [plane[..., start : start + part.rows + self.window - 1, :] for plane in self.wide]
+        top, left = rows.start // self.size, cols.start // self.size * self.size
+        part.rows, part.cols = (rows.stop - rows.start) // self.size, (cols.stop - cols.start) // self.size
+        down = slice(top, top + part.rows + self.window - 1)
+        along = slice(left, left + (part.cols + self.window - 1) * self.size)
+        part.wide = [plane[image : image + 1, ..., down, along] for plane in self.wide]
         return part
 
     def _widen(self, plane: Tensor) -> Tensor:
@@ -197,6 +200,7 @@ def affinity_filter(
     log_n: Tensor,
     values: Tensor,
     windows: Sequence[int],
+    active: Tensor | None = None,
 ) -> Tensor:
     """Filters values over a pyramid with affinity kernels.
 
@@ -206,11 +210,17 @@ def affinity_filter(
     log_n : (B, H, W) log occupancy of each source, -inf for none
     values : (B, C, H, W) per unit of occupancy
     windows : odd window size of each level, in cells of 2**level pixels
+    active : (B, ceil(H / 64), ceil(W / 64)) bool, which cells of ACTIVE_CELL pixels are wanted; default all. The
+        targets of others are left out and 0, their sources count. Not with a gradient, nor above 7 levels.
 
     Returns
     -------
     (B, C, H, W) means over the reached sources; 0 where no source is in reach.
     """
+    if active is not None:
+        shape = (len(log_n), *(math.ceil(side / ACTIVE_CELL) for side in log_n.shape[-2:]))
+        if torch.is_grad_enabled() or len(windows) > 7 or active.shape != shape:
+            raise ValueError(f"active cells {tuple(active.shape)}, expected {shape}, at most 7 levels, no gradient")
     # Only differences of features count, and |f_t - f_s|^2 is computed as |f_t|^2 - 2 f_t f_s + |f_s|^2: what all
     # features have in common would only cost digits.
     features = features - features.detach().mean((2, 3), keepdim=True)
@@ -232,10 +242,26 @@ def affinity_filter(
     if torch.is_grad_enabled():
         apply: Callable[..., Tensor] = _AffinityFilter.apply
         return apply(features, target_preference, sizes, tuple(windows), *cells)[..., :height, :width]
-    levels, step = _levels(sizes, windows, cells), max(size, BAND_ROWS // size * size)
-    out = torch.empty_like(values)
-    for first in range(0, values.shape[-2], step):
-        rows = slice(first, min(first + step, values.shape[-2]))
-        band = [level.band(rows.start, rows.stop) for level in levels]
-        out[:, :, rows] = _filter(band, features[:, :, rows], target_preference[:, :, rows])[0]
+    levels = _levels(sizes, windows, cells)
+    out = torch.zeros_like(values)
+    for image, rows, cols in _tiles(out, active, size):
+        tile = [level.tile(image, rows, cols) for level in levels]
+        here = (slice(image, image + 1), slice(None), rows, cols)
+        out[here] = _filter(tile, features[here], target_preference[here])[0]
     return out[..., :height, :width]
+
+
+def _tiles(picture: Tensor, active: Tensor | None, size: int) -> Iterator[tuple[int, slice, slice]]:
+    """Images, rows and columns that cover the active cells of a picture (B, C, H, W): runs of cells along a row."""
+    batch, _, height, width = picture.shape
+    step = max(ACTIVE_CELL, size)
+    for image in range(batch):
+        for row in range(math.ceil(height / step)):
+            rows = slice(row * step, min((row + 1) * step, height))
+            wanted = [True] * math.ceil(width / step) if active is None else active[image, row].tolist()
+            start = 0
+            for on, run in groupby(wanted):
+                stop = start + len(list(run))
+                if on:
+                    yield image, rows, slice(start * step, min(stop * step, width))
+                start = stop

@@ -73,6 +73,26 @@ def test_filter_equals_the_definition(shape: tuple[int, int], windows: tuple[int
     torch.testing.assert_close(affinity_filter(*planes, windows)[0], expected)
 
 
+def test_inactive_cells_are_left_out_and_still_serve_as_sources() -> None:
+    planes = random_planes(4, 130, 200, 4)
+    pair = [torch.cat([plane, plane.flip(-1)]) for plane in planes]
+    expected = affinity_filter(*pair, (3, 3, 1, 3))
+    active = torch.rand(2, 3, 4, generator=torch.Generator().manual_seed(5)) < 0.5
+    wanted = active.repeat_interleave(64, 1).repeat_interleave(64, 2)[:, None, :130, :200]
+    assert bool(wanted.any())
+    with torch.no_grad():
+        torch.testing.assert_close(affinity_filter(*pair, (3, 3, 1, 3)), expected)
+        torch.testing.assert_close(affinity_filter(*pair, (3, 3, 1, 3), active), torch.where(wanted, expected, 0))
+
+
+def test_active_cells_of_another_shape_or_with_a_gradient_are_refused() -> None:
+    planes = random_planes(4, 65, 64, 1)
+    with pytest.raises(ValueError, match=r"expected \(1, 2, 1\)"), torch.no_grad():
+        affinity_filter(*planes, (3,), torch.ones(1, 1, 1, dtype=torch.bool))
+    with pytest.raises(ValueError, match="no gradient"):
+        affinity_filter(*planes, (3,), torch.ones(1, 2, 1, dtype=torch.bool))
+
+
 def test_derivative_of_the_filter() -> None:
     features, bias, preference, log_n, values = random_planes(2, 4, 5, 2)
     known = log_n > -math.inf
