@@ -168,6 +168,7 @@ FAST = Config(
     reducer=(32, 32, 24),
     partitioner=(24, 16),
     generator=(48, 48),
+    kernel_sizes=(5, 3, 3, 3, 3, 3),
 )
 
 CONFIGS: Mapping[str, Config] = {

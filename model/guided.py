@@ -20,7 +20,7 @@ from model.samples import Samples
 GUIDE_SCALES = (2.0, 2.0, 2.0, 3.0, 1.5, 1.5, 1.5)  # normal, log depth, divisor: the joint bilateral filter at step 0
 # What a log unit of glare takes from a source's logit at each coarser level: a cell that holds a corner of a lamp is
 # hardly farther from its dark pixels than one without, and a thousand times brighter.
-GLARE_PER_LEVEL = 0.5  # validation: at 1 the picture loses 1.7 % of its energy, at 0.5 0.7 %
+GLARE_PER_LEVEL = 0.5
 GLARE_SCALE = 2.0  # of glare as a feature
 GLARE_START = 3.0  # log(1 + exposure L): radiance about 20 times the frame's middle
 DIVISOR_GUIDE_SCALE = 6.0  # the divisor's own, sharper kernel
@@ -47,7 +47,7 @@ def glare(radiance: Tensor, exposure: float) -> Tensor:
     """Radiance (B, 3, H, W) -> (B, 1, H, W): log units beyond GLARE_START, else 0.
 
     As a feature it keeps lamps, a thousand times their surroundings, from leaking out of their edges; radiance below
-    is no guide, since its differences are mostly noise. It is not learned: no training scene has such contrast.
+    is no guide, since its differences are mostly noise. A gate is learned: a lamp out of focus is noisy, too.
     """
     return (log_radiance(radiance.amax(1, keepdim=True), exposure) - GLARE_START).clamp_min(0)
 
@@ -61,10 +61,10 @@ def demodulated_lights(samples: Samples) -> list[Tensor]:
 
 
 def generator_sizes(config: Config) -> tuple[int, ...]:
-    """What the generator predicts per layer: features, bias and preference per level, guide gate;
+    """What the generator predicts per layer: features, bias and preference per level, gates of guides and glare;
     with demodulation also the mix, the divisor's gate and the divisor's bias."""
     levels = len(config.kernel_sizes)
-    sizes = (config.affinity_features, levels, levels, 1)
+    sizes = (config.affinity_features, levels, levels, 1, 1)
     return (*sizes, 1, 1, 1) if config.demodulation else sizes
 
 
@@ -101,8 +101,8 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
     log_n, log_w = planes[:, 0], planes[:, 1]
     share = share_of(log_n, log_w)[:, None]
     own = torch.where(share > 0, share, 1)  # values per unit of the layer's own weight: divide by this
-    features, bias, preference, gate, *divided = torch.split(predictions, list(generator_sizes(config)), 1)
-    beyond = glare(planes[:, RADIANCE] / own, scale.exposure)
+    features, bias, preference, gate, glare_gate, *divided = torch.split(predictions, list(generator_sizes(config)), 1)
+    beyond = glare(planes[:, RADIANCE] / own, scale.exposure) * (2 * torch.sigmoid(glare_gate))
     guides = planes[:, GUIDES] / own
     bias = bias - beyond * GLARE_PER_LEVEL * torch.arange(bias.shape[1], device=bias.device)[:, None, None]
     features = features + torch.einsum("bghw,fg->bfhw", guides, guide_matrix) * (2 * torch.sigmoid(gate))
