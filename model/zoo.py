@@ -1,12 +1,10 @@
-"""The weights that ship with lbmc: presets by name, and reading and writing of weight files.
+"""The networks of weight files: presets by name, and reading and writing of weight files as networks.
 
-A weight file is safetensors, float16, with one JSON document in its metadata: the network's config and how it was
-trained (data, steps, scores). Nothing is downloaded and nothing in a file is executed.
+How a weight file is laid out, and what can be known of it without torch, is weight_files.py's.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,17 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save_file
 
 from model.config import Config
 from model.denoiser import Denoiser
+from model.weight_files import FORMAT, METADATA_KEY, SUFFIX, digest_of, presets, read_document, weight_path
 
-WEIGHTS = Path(__file__).parent / "weights"
-SUFFIX = ".safetensors"
-METADATA_KEY = "lbmc"
-FORMAT = 1
-DEFAULT_PRESET = "fast"
+__all__ = ["SUFFIX", "Weights", "find", "list_models", "presets", "save"]
 
 
 @dataclass(frozen=True)
@@ -44,7 +39,7 @@ class Weights:
     @cached_property
     def digest(self) -> str:
         """The first 12 hex digits of the file's SHA-256."""
-        return hashlib.sha256(self.path.read_bytes()).hexdigest()[:12]
+        return digest_of(self.path)
 
     def load(self) -> Denoiser:
         """The network in float32, in evaluation mode. Raises ValueError where the tensors do not fit the config."""
@@ -59,33 +54,13 @@ class Weights:
         return net.eval()
 
 
-def presets() -> list[str]:
-    """Names of the presets that ship, sorted."""
-    return sorted(path.stem for path in WEIGHTS.glob(f"*{SUFFIX}"))
-
-
 def find(name: str | None = None) -> Weights:
     """The weights of a preset, of a .safetensors file, or (None) of the default preset.
 
     Raises ValueError: no such preset (the message lists those there are), or not a weight file of lbmc.
     """
-    if name is None:
-        name = DEFAULT_PRESET
-    path = Path(name) if name.endswith(SUFFIX) else WEIGHTS / f"{name}{SUFFIX}"
-    if not path.is_file():
-        if name.endswith(SUFFIX):
-            raise ValueError(f"{path}: no such weight file")
-        raise ValueError(f"no preset {name!r}; there are {', '.join(presets()) or 'none'}, or pass a {SUFFIX} file")
-    try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-    except (SafetensorError, OSError) as error:
-        raise ValueError(f"{path}: not a safetensors file ({error})") from None
-    if METADATA_KEY not in metadata:
-        raise ValueError(f"{path}: weights, but not of lbmc (no {METADATA_KEY!r} entry in its metadata)")
-    document = json.loads(metadata[METADATA_KEY])
-    if document["format"] != FORMAT:
-        raise ValueError(f"{path}: weight format {document['format']}, this lbmc reads {FORMAT}; upgrade lbmc")
+    path = weight_path(name)
+    document = read_document(path)
     return Weights(path.stem, path, Config.from_dict(document["config"]), document["info"])
 
 

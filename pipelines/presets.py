@@ -1,11 +1,12 @@
-"""What `lbmc models` shows: the weights that ship, with what their files say about themselves."""
+"""What `lbmc models` shows: the weights that ship, with what their files say about themselves. Imports no torch."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from model.zoo import DEFAULT_PRESET, Weights, list_models
+from model import weight_files
 
 
 @dataclass(frozen=True)
@@ -24,16 +25,17 @@ class Preset:
 
 def presets() -> list[Preset]:
     """Every preset that ships, by name. Raises ValueError when a weight file in the package is broken."""
-    return [_preset(weights) for weights in list_models()]
+    return [_preset(weight_files.weight_path(name)) for name in weight_files.presets()]
 
 
-def _preset(weights: Weights) -> Preset:
+def _preset(path: Path) -> Preset:
+    document = weight_files.read_document(path)
     return Preset(
-        name=weights.name,
-        default=weights.name == DEFAULT_PRESET,
-        path=str(weights.path),
-        bytes=weights.path.stat().st_size,
-        digest=weights.digest,
-        config=weights.config.to_dict(),
-        info=weights.info,
+        name=path.stem,
+        default=path.stem == weight_files.DEFAULT_PRESET,
+        path=str(path),
+        bytes=path.stat().st_size,
+        digest=weight_files.digest_of(path),
+        config=document["config"],
+        info=document["info"],
     )

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from model import zoo
+from model import weight_files, zoo
 from tests.end_to_end.scenes import random_weights
-from tests.runner import Runner, in_process
+from tests.runner import Runner, environment, in_process
 
 
 def test_every_weight_file_of_the_package_is_listed(lbmc: Runner) -> None:
@@ -21,8 +23,8 @@ def test_every_weight_file_of_the_package_is_listed(lbmc: Runner) -> None:
 
 def test_json_tells_config_recipe_and_hash(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     random_weights(tmp_path / "tiny.safetensors")
-    monkeypatch.setattr(zoo, "WEIGHTS", tmp_path)
-    monkeypatch.setattr(zoo, "DEFAULT_PRESET", "tiny")
+    monkeypatch.setattr(weight_files, "WEIGHTS", tmp_path)
+    monkeypatch.setattr(weight_files, "DEFAULT_PRESET", "tiny")
     (found,) = json.loads(in_process("models", "--json").out)
     assert found["name"] == "tiny"
     assert found["digest"] == zoo.find("tiny").digest
@@ -32,5 +34,16 @@ def test_json_tells_config_recipe_and_hash(monkeypatch: pytest.MonkeyPatch, tmp_
 
 
 def test_without_presets_it_says_what_to_do(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(zoo, "WEIGHTS", tmp_path)
+    monkeypatch.setattr(weight_files, "WEIGHTS", tmp_path)
     assert "--model" in in_process("models").out
+
+
+def test_listing_them_imports_no_torch() -> None:
+    code = """
+import sys
+from lbmc_cli.main import main
+assert main(["models"]) == 0
+print("torch" in sys.modules, file=sys.stderr)
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment(), check=True)
+    assert run.stderr == "False\n"

@@ -43,6 +43,10 @@ def test_what_is_not_ours_is_refused_by_name(tmp_path: Path) -> None:
     save_file({"x": torch.zeros(1)}, foreign)
     with pytest.raises(ValueError, match="not of lbmc"):
         zoo.find(str(foreign))
+    for metadata, reason in (("{", "is broken"), ("[]", "is broken"), ("{}", "is broken"), ('{"format": 99}', "99")):
+        save_file({"x": torch.zeros(1)}, foreign, {"lbmc": metadata})
+        with pytest.raises(ValueError, match=rf"foreign\.safetensors: .*{reason}"):
+            zoo.find(str(foreign))
 
 
 def test_weights_of_another_network_are_refused_by_name(tmp_path: Path) -> None:
