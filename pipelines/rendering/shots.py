@@ -14,19 +14,21 @@ import numpy.typing as npt
 
 from model.metrics import EPSILON, common_scale, score
 from pipelines.rendering.patterns import join, make_pattern, shuffle_order
-from pipelines.rendering.tracer import TIME_BINS, SceneTracer
+from pipelines.rendering.tracer import EMISSION, TIME_BINS, SceneTracer
 from pipelines.rendering.views import View, add_camera_motion, add_defocus, choose_view, draw_object_motions
 
 Array = npt.NDArray[np.float32]
 
 ATTEMPTS = 12
-# Scenes are scaled so that the metrics' exposure is 1, then by a random factor. Paths brighter than CLAMP at that
-# exposure, where the middling brightness is 0.5, are cut alike in samples and reference: else references of some
-# hundred samples would be mostly fireflies.
-CLAMP = 60.0
+# Scenes are scaled so that the metrics' exposure is 1, then by a random factor. Scattered light brighter than a scene's
+# draw from CLAMP at that exposure, where the middling brightness is 0.5, is cut alike in samples and reference: else
+# references of some hundred samples would be mostly fireflies. Lamps and suns in view hardly add noise, and their
+# contrast is what denoisers stumble over: they are cut at EMISSION_CLAMP only.
+CLAMP = (60.0, 240.0)
+EMISSION_CLAMP = 1e4
 BRIGHTNESS_STOPS = 1.5  # standard deviation
 # relMSE of eight samples, estimated from a pilot: easier scenes teach little, harder ones are noise alone.
-EASIEST, EASY, HARDEST = 0.05, 0.25, 2.0
+EASIEST, EASY, HARDEST = 0.03, 0.12, 1.2
 EASY_KEPT = 0.5
 LIT, CONTRAST = 0.75, 0.08  # least share of surfaces that any path lights, least deviation of log brightness
 PILOT, PILOT_SAMPLES = 64, 16
@@ -113,7 +115,7 @@ def _worth(tracer: SceneTracer, view: View, black: bool, rng: np.random.Generato
     if not hit.any() or (image[hit].mean(1) > 0).mean() < LIT:
         return False
     scale = _exposure(image.reshape(PILOT, PILOT, 3))
-    noise = estimated_noise(np.minimum(radiance, CLAMP / scale))
+    noise = estimated_noise(np.minimum(radiance, CLAMP[0] / scale))
     if np.log1p(image.mean(1) * scale).std() < CONTRAST or not EASIEST < noise < HARDEST:
         return False
     return noise > EASY or bool(rng.random() < EASY_KEPT)
@@ -140,16 +142,19 @@ def _expose(tracer: SceneTracer, view: View, black: bool, rng: np.random.Generat
     noisy = _stack(channels, n).mean(1).reshape(size, size, 3)
     scale = _exposure(noisy)
     brightness = float(np.exp2(rng.normal(0, BRIGHTNESS_STOPS)))
+    limit = float(np.exp(rng.uniform(*np.log(CLAMP))))
     for part in (channels, *passes):
-        for c in "RGB":
-            part[c] = np.minimum(part[c] * np.float32(scale), CLAMP) * np.float32(brightness)
+        for c, name in zip("RGB", EMISSION, strict=True):
+            emitted = part.pop(name)
+            scattered = np.minimum((part[c] - emitted) * scale, limit)
+            part[c] = ((np.minimum(emitted * scale, EMISSION_CLAMP) + scattered) * brightness).astype(np.float32)
     means = [np.stack([part[c].reshape(size, size, -1).mean(2, dtype=np.float64) for c in "RGBA"], -1)
              for part in passes]
     reference = np.mean(means, 0).astype(np.float32)
     about = tracer.describe() | {
         "settings": asdict(settings), "defocus": view.defocus, "camera_motion": view.camera_motion,
         "object_motion": view.object_motion, "stratified": stratified, "black_background": black,
-        "brightness": brightness, "non_finite_paths": broken, **_measure(channels, reference, n)}
+        "brightness": brightness, "clamp": limit, "non_finite_paths": broken, **_measure(channels, reference, n)}
     return Shot(channels, reference, about)
 
 
@@ -166,7 +171,7 @@ def _trace(tracer: SceneTracer, view: View, stratified: bool, rng: np.random.Gen
         both = tracer.trace(view.camera, join(pattern, target), seeds[0])
         tables = {name: values.reshape(pixels, -1) for name, values in both.items()}
         return ({name: table[:, :n].ravel() for name, table in tables.items()},
-                [{name: tables[name][:, n:].ravel() for name in "RGBA"}])
+                [{name: tables[name][:, n:].ravel() for name in ("R", "G", "B", "A", *EMISSION)}])
     channels = tracer.trace(view.camera, pattern, seeds[0], stratified)
     count = max(1, round(reference / (JOINT_REFERENCE if tracer.moving else REFERENCE_PASS)))
     shares = [reference // count + (k < reference % count) for k in range(count)]
@@ -190,8 +195,9 @@ def _stack(channels: dict[str, Array], samples: int) -> Array:
 
 def _clean(channels: dict[str, Array], black: bool) -> int:
     """Zero non-finite radiance in place, and that of misses if the background is to be black. Count the former."""
-    bad = ~np.isfinite(channels["R"] + channels["G"] + channels["B"])
-    for c in "RGB":
+    light = ("R", "G", "B", *EMISSION)
+    bad = ~np.isfinite(np.sum([channels[c] for c in light], 0))
+    for c in light:
         channels[c][bad] = 0.0
         if black:
             channels[c] *= channels["A"]

@@ -33,6 +33,7 @@ MOTION_LIMIT = 512.0  # pixels; points that cross the camera plane project to in
 LAUNCH = 1_200_000
 MULTIJITTER = 16  # that sampler's strata need a square number
 SEEDS = 2**31
+EMISSION = ("emission.R", "emission.G", "emission.B")
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,8 @@ class SceneTracer(ABC):
         self.dr = drjit
         self.scene = scene
         self.params = self.mi.traverse(scene)
-        self.integrator = self.mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "rr_depth": NO_ROULETTE})
+        self.integrator = self._integrator(MAX_DEPTH)
+        self._seen_emission = self._integrator(1)
         # Shapes are told apart by the number Dr.Jit gives them, which need not start at 0.
         numbers = np.array(drjit.reinterpret_array(self.mi.UInt32, self.mi.ShapePtr(scene.shapes())))
         table = np.zeros((int(numbers.max()) + 1, len(SurfaceLook().row()) + 1), np.float32)
@@ -122,6 +124,9 @@ class SceneTracer(ABC):
         self._has_cutouts = any(look.cutout for look in looks)
         self._moving: list[MovingMesh] = []
         self.set_moving([])
+
+    def _integrator(self, depth: int) -> Any:
+        return self.mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": NO_ROULETTE})
 
     @property
     def moving(self) -> bool:
@@ -169,7 +174,8 @@ class SceneTracer(ABC):
               features: Literal["all", "coverage"] = "all") -> dict[str, Array]:
         """The pattern's N = P * S paths, pixel-major: canonical channel name -> (N,), P = camera.size ** 2.
 
-        `features` "coverage" gives R, G, B and A only. When objects move, the pattern's times must be the centres of
+        `features` "coverage" gives R, G, B, EMISSION and A only. EMISSION is the part of R, G, B that
+        the surface or sky in view emits itself. When objects move, the pattern's times must be the centres of
         TIME_BINS bins. `multijitter` stratifies the paths' own numbers too, where nothing moves.
         """
         pixels, samples = pattern.time.shape
@@ -220,7 +226,10 @@ class SceneTracer(ABC):
         dr.eval(ray)
         radiance, _, _ = self.integrator.sample(self.scene, sampler, mi.RayDifferential3f(ray))
         dr.eval(radiance)  # else the path is traced once per channel
-        out = {name: np.array(values) for name, values in zip("RGB", radiance, strict=True)}
+        emission, _, _ = self._seen_emission.sample(self.scene, sampler, mi.RayDifferential3f(ray))
+        dr.eval(emission)
+        out = {name: np.array(values) for name, values in zip(("R", "G", "B", *EMISSION), (*radiance, *emission),
+                                                              strict=True)}
         if features == "coverage" and not self._has_cutouts:
             return out | {"A": np.array(self.scene.ray_test(ray), dtype=np.float32)}
         hit = self._first_hit(rig, ray, mi.Float(time))
