@@ -1,6 +1,8 @@
 """Frame sequences: `shot.####.exr`, `shot.%04d.exr`, `shot.$F4.exr` and `--frames 1001-1100x2`, into files.
 
-A `#` stands for one digit (Fileseq's PAD_STYLE_HASH1), so #### means 4 digits. Opens no file.
+A `#` or `@` stands for one digit (as in Fileseq's PAD_STYLE_HASH1), so #### means 4 digits; the range of frames may
+also stand before it, `shot.1001-1010####.exr`. Ranges are Fileseq's; names are taken apart here, because Fileseq
+refuses or silently passes by folders and names with a further `#`, `@`, bracket or digit in them. Opens no file.
 """
 
 from __future__ import annotations
@@ -11,16 +13,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fileseq.constants import PAD_STYLE_HASH1
-from fileseq.exceptions import FileSeqException
-from fileseq.filesequence import FileSequence
 from fileseq.frameset import FrameSet
 
 from deep_io.errors import InputError, UsageError
 
 PathLike = str | os.PathLike[str]
 
-_PATTERN = re.compile(r"#|@|%0?\d*d|\$F\d*")  # what stands for the frame number in a file's name
+# What stands for the frame number in a file's name. An @ inside a word, as in user@host.exr, does not.
+_NUMBER = re.compile(r"#+|@+(?![A-Za-z0-9@])|(?:%0?(?P<printf>\d*)d|\$F(?P<houdini>\d*))(?![A-Za-z])")
+_RANGE_BEFORE = re.compile(r"(?:^|(?<=[^A-Za-z0-9,:-]))(?P<range>\d+[-\d,x:]*)$")
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,33 @@ class Frame:
         return self.source.name
 
 
+@dataclass(frozen=True)
+class _Pattern:
+    """A name taken apart: the frame number, of at least `width` characters, goes between `head` and `tail`."""
+
+    folder: Path
+    head: str
+    width: int
+    tail: str
+    frames: str
+    """The range written before the number, "" for none."""
+
+    def frame(self, number: int) -> Path:
+        """The file of one frame."""
+        return self.folder / f"{self.head}{str(number).zfill(self.width)}{self.tail}"
+
+    def on_disk(self) -> list[int]:
+        """The numbers of the files that exist, ascending. Raises OSError."""
+        name = re.compile(re.escape(self.head) + r"(-?\d+)" + re.escape(self.tail))
+        matches = (name.fullmatch(entry) for entry in os.listdir(self.folder))
+        numbers = {int(match[1]) for match in matches if match}
+        # Only names that the pattern itself would give: shot.1.exr is no frame of shot.####.exr.
+        return sorted(number for number in numbers if self.frame(number).is_file())
+
+
 def has_pattern(path: PathLike) -> bool:
     """Whether the name holds a frame pattern, whatever exists on disk."""
-    return _PATTERN.search(Path(path).name) is not None
+    return bool(_numbers(Path(path).name))
 
 
 def is_sequence(path: PathLike) -> bool:
@@ -48,7 +73,10 @@ def is_sequence(path: PathLike) -> bool:
 def parse_frames(text: str) -> list[int]:
     """The frames of `--frames`, in the order given, each once: "1001-1100x2", "1,3,7-9". Raises UsageError."""
     try:
-        frames = [int(frame) for frame in FrameSet(text)]
+        found = list(FrameSet(text))
+        frames = [int(frame) for frame in found]
+        if frames != found:
+            raise ValueError("frames are whole numbers")
     except (ValueError, TypeError) as error:
         raise UsageError(f"--frames {text}: not a frame range; write 1001-1100, 1001-1100x2 or 1,3,7-9") from error
     if not frames:
@@ -57,8 +85,14 @@ def parse_frames(text: str) -> list[int]:
 
 
 def frame_path(pattern: PathLike, number: int) -> Path:
-    """The file of one frame of a pattern."""
-    return Path(_sequence(pattern).frame(number))
+    """The file of one frame of a pattern. Raises UsageError for a name that holds none."""
+    return _parse(pattern).frame(number)
+
+
+def sibling_path(path: PathLike, number: int) -> Path | None:
+    """Another frame of the shot that a file such as shot.1002.exr belongs to; None where its name has no number."""
+    found = re.fullmatch(r"(|.*[^0-9])(\d+)(\D*\.[^.]+)", Path(path).name)
+    return Path(path).with_name(f"{found[1]}{str(number).zfill(len(found[2]))}{found[3]}") if found else None
 
 
 def expand(source: PathLike, frames: str | None = None) -> list[Frame]:
@@ -73,14 +107,10 @@ def expand(source: PathLike, frames: str | None = None) -> list[Frame]:
         if not os.path.isfile(source):
             raise InputError(f"{os.fspath(source)}: {_why_no_file(source)}")
         return [Frame(None, Path(source))]
-    sequence = _sequence(source)
-    if frames is not None:
-        numbers = parse_frames(frames)
-    elif written := sequence.frameSet():
-        numbers = [int(number) for number in written]  # shot.1001-1010####.exr
-    else:
-        numbers = _on_disk(source)
-    found = [Frame(number, Path(sequence.frame(number))) for number in numbers]
+    pattern = _parse(source)
+    wanted = frames if frames is not None else pattern.frames
+    numbers = parse_frames(wanted) if frames is not None or wanted else _on_disk(source, pattern)
+    found = [Frame(number, pattern.frame(number)) for number in numbers]
     missing = [frame for frame in found if not frame.source.is_file()]
     if missing:
         listed = FrameSet([frame.number for frame in missing if frame.number is not None])
@@ -113,8 +143,7 @@ def pair(source: PathLike, target: PathLike, frames: str | None = None) -> list[
     found = expand(source, frames)
     if not many:
         return [Frame(None, found[0].source, Path(target))]
-    pattern = _sequence(target)
-    return [Frame(frame.number, frame.source, Path(pattern.frame(str(frame.number)))) for frame in found]
+    return [Frame(frame.number, frame.source, frame_path(target, frame.number or 0)) for frame in found]
 
 
 def substitute(pattern: PathLike, token: str, values: Sequence[object]) -> list[str]:
@@ -125,24 +154,39 @@ def substitute(pattern: PathLike, token: str, values: Sequence[object]) -> list[
     return [text.replace(token, str(value)) for value in values]
 
 
-def _sequence(pattern: PathLike) -> FileSequence:
+def _numbers(name: str) -> list[re.Match[str]]:
+    """Where a name may hold the frame number; an @, or the # of take#2, counts only where nothing else does."""
+    found = list(_NUMBER.finditer(name))
+    found = [match for match in found if match[0][0] != "@"] or found
+    return [match for match in found if not name[match.end():match.end() + 1].isalnum()] or found
+
+
+def _parse(pattern: PathLike) -> _Pattern:
+    """Raises UsageError unless the name holds exactly one pattern."""
+    path = Path(pattern)
+    found = _numbers(path.name)
+    if len(found) != 1:
+        several = " and ".join(match[0] for match in found)
+        raise UsageError(f"{os.fspath(pattern)}: "
+                         + (f"holds {several}; write the frame number once" if found
+                            else "the name has no pattern such as ####"))
+    match = found[0]
+    head, tail = path.name[:match.start()], path.name[match.end():]
+    written = match["printf"] if match["printf"] is not None else match["houdini"]
+    width = len(match[0]) if written is None else int(written or 1)
+    before = _RANGE_BEFORE.search(head)
+    return _Pattern(path.parent, head[:before.start()] if before else head, width, tail,
+                    before["range"] if before else "")
+
+
+def _on_disk(source: PathLike, pattern: _Pattern) -> list[int]:
+    """The numbers of the files that match a pattern, ascending. Raises InputError when there is none."""
+    if not pattern.folder.is_dir():
+        raise InputError(f"{os.fspath(source)}: the folder {pattern.folder} does not exist")
     try:
-        return FileSequence(os.fspath(pattern), pad_style=PAD_STYLE_HASH1)
-    except FileSeqException as error:
-        raise UsageError(f"{os.fspath(pattern)}: not a frame pattern: {error}") from error
-
-
-def _on_disk(source: PathLike) -> list[int]:
-    """The numbers of the files that match a pattern, ascending."""
-    sequence = _sequence(source)
-    folder = Path(sequence.dirname() or ".")
-    if not folder.is_dir():
-        raise InputError(f"{os.fspath(source)}: the folder {folder} does not exist")
-    name = re.compile(re.escape(sequence.basename()) + r"(-?\d+)" + re.escape(sequence.extension()))
-    matches = (name.fullmatch(entry) for entry in os.listdir(folder))
-    numbers = [int(match[1]) for match in matches if match]
-    # Only names that the pattern itself would give: shot.1.exr is no frame of shot.####.exr.
-    numbers = sorted({number for number in numbers if os.path.isfile(sequence.frame(number))})
+        numbers = pattern.on_disk()
+    except OSError as error:
+        raise InputError(f"{os.fspath(source)}: {pattern.folder} cannot be listed: {error.strerror}") from error
     if not numbers:
         raise InputError(f"{os.fspath(source)}: no file matches the pattern")
     return numbers

@@ -7,7 +7,16 @@ from pathlib import Path
 import pytest
 
 from deep_io.errors import InputError, UsageError
-from deep_io.sequences import expand, frame_path, is_sequence, pair, parse_frames, substitute
+from deep_io.sequences import (
+    expand,
+    frame_path,
+    has_pattern,
+    is_sequence,
+    pair,
+    parse_frames,
+    sibling_path,
+    substitute,
+)
 
 
 @pytest.fixture
@@ -61,7 +70,7 @@ def test_inputs_and_outputs_that_do_not_fit_are_unsuitable(shot, source, target,
         pair(shot / source, target)
 
 
-@pytest.mark.parametrize("text", ["1001-", "a-b", "", "1-5x0", "1001-1100x2y"])
+@pytest.mark.parametrize("text", ["1001-", "a-b", "", "1-5x0", "1001-1100x2y", "1.5", "1-1000000000"])
 def test_ranges_that_cannot_be_read_are_usage_errors(shot, text):
     with pytest.raises(UsageError, match="--frames"):
         expand(shot / "shot.####.exr", text)
@@ -89,3 +98,35 @@ def test_a_token_is_replaced_by_each_value(tmp_path):
     assert substitute("s@SEED@.####.exr", "@SEED@", [1, 2]) == ["s1.####.exr", "s2.####.exr"]
     with pytest.raises(UsageError, match="does not hold @SEED@"):
         substitute("s.####.exr", "@SEED@", [1])
+
+
+@pytest.mark.parametrize("name", [
+    "renders#2/shot.####.exr", "a@b/shot.####.exr", "shot_v2####.exr", "take#2.####.exr", "user@host.####.exr",
+    "shot####x2.exr", "shot.####_left.exr", "x(####).exr", "x.[####].exr", "100%.####.exr", "a b é.####.exr", "####",
+])
+def test_only_the_number_of_a_name_is_replaced(name, tmp_path):
+    expected = Path(name.replace("####", "0007"))
+    assert frame_path(name, 7) == expected
+    (tmp_path / expected).parent.mkdir(exist_ok=True)
+    (tmp_path / expected).touch()
+    assert [frame.source for frame in expand(tmp_path / name)] == [tmp_path / expected]
+
+
+@pytest.mark.parametrize("name", ["user@host.exr", "take@2.exr", "beauty.exr", "$Final.exr", "100%done.exr"])
+def test_a_word_with_a_sign_in_it_is_no_pattern(name, tmp_path):
+    (tmp_path / "in.exr").touch()
+    assert not has_pattern(name)
+    assert pair(tmp_path / "in.exr", tmp_path / name)[0].target == tmp_path / name
+    with pytest.raises(UsageError, match="no pattern such as ####"):
+        frame_path(name, 1)
+
+
+@pytest.mark.parametrize("name", ["shot.%03d.####.exr", "shot.####.####.exr"])
+def test_a_name_with_two_numbers_is_refused(name, tmp_path):
+    with pytest.raises(UsageError, match="write the frame number once"):
+        expand(tmp_path / name)
+
+
+def test_the_neighbour_of_a_single_frame_is_found_by_its_number():
+    assert sibling_path("shots/shot.v2.1002.deep.exr", 998) == Path("shots/shot.v2.0998.deep.exr")
+    assert sibling_path("beauty.exr", 1) is None
