@@ -108,6 +108,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         refuse_shadowed_packages()
     except click.ClickException as error:
         return _report(error.format_message(), error.exit_code)
+    # OpenMP reads it when torch is loaded. Threads that wait by spinning cost five to forty times the work itself on
+    # a machine that other processes share, which farm machines are; sleeping costs nothing measurable on an idle one.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from pipelines.signals import StoppedError, stopped_by_signals
 
     warnings.showwarning = _show_warning
