@@ -1,15 +1,16 @@
 """Training losses on pictures (B, 3, H, W), in the common scale of the metrics (`k * radiance`, see metrics.py).
 
 The target is noisy, too. Squared errors whose divisor depends on the prediction alone have the clean picture as their
-minimum whatever the target's noise (Lehtinen et al. 2018, "Noise2Noise", section 3); SMAPE does not, its minimum lies
-nearer to the median, so it enters with a small weight and only its low frequencies, where the noise is averaged away,
-with a large one.
+minimum whatever the target's noise (Lehtinen et al. 2018, "Noise2Noise", section 3): `relative_error`. SMAPE and errors
+of tone-mapped pictures do not, their minimum lies nearer to the median, so they want clean targets, or their low
+frequencies only, where the noise is averaged away.
+
+Every term is a mean over the crops, so the loss of a batch is the mean of the losses of its parts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 import torch.nn.functional as F
@@ -17,15 +18,23 @@ from torch import Tensor
 
 EPSILON = 0.01  # of both SMAPE and relative error, the metrics' own
 OUTLIER = 100.0  # relative squared errors saturate here: one firefly in a target must not own a step
+LOG_FLOOR = 1e-3  # added to a crop's relative error before its logarithm
+SRGB_LINEAR, SRGB_SLOPE, SRGB_SCALE, SRGB_OFFSET, SRGB_POWER = 0.0031308, 12.92, 1.055, 0.055, 2.4
 
 
 @dataclass(frozen=True)
 class LossWeights:
-    """How much each term counts. `pooled` are pairs of cell size in pixels and weight."""
+    """How much each term counts; a term of weight 0 is not computed."""
 
-    smape: float = 0.5
-    relative: float = 0.2  # log of the crop's relative squared error
-    pooled: Sequence[tuple[int, float]] = ((8, 0.5), (32, 0.5))
+    smape: float = field(default=0.5, metadata={"about": "SMAPE, the paper's loss: |d - y| / (|d| + |y| + 0.01)"})
+    relative: float = field(default=0.2, metadata={
+        "about": "log of a crop's relative squared error (d - y)^2 / (d^2 + 0.01), d^2 a constant, outliers saturated; "
+                 "a hard crop counts no more than an easy one"})
+    noise2noise: float = field(default=0.0, metadata={
+        "about": "the same error, plain: neither logarithm nor saturation, safe for noisy references"})
+    tone_mapped: float = field(default=0.0, metadata={"about": "squared error of pictures as sRGB of log(1 + x)"})
+    pooled: tuple[tuple[int, float], ...] = field(default=((8, 0.5), (32, 0.5)), metadata={
+        "about": "pairs of a cell size in pixels and the weight of the SMAPE of pictures averaged over such cells"})
 
 
 def smape(prediction: Tensor, target: Tensor) -> Tensor:
@@ -33,19 +42,55 @@ def smape(prediction: Tensor, target: Tensor) -> Tensor:
     return ((prediction - target).abs() / (prediction.abs() + target.abs() + EPSILON)).mean()
 
 
+def relative_error(prediction: Tensor, target: Tensor) -> Tensor:
+    """(d - y)^2 / (stopgrad(d)^2 + 0.01) per value."""
+    return (prediction - target).square() / (prediction.detach().square() + EPSILON)
+
+
+def noise2noise(prediction: Tensor, target: Tensor) -> Tensor:
+    """Mean of `relative_error`: its gradient vanishes, on average over noisy targets, at their mean."""
+    return relative_error(prediction, target).mean()
+
+
 def log_relative(prediction: Tensor, target: Tensor) -> Tensor:
-    """Mean over crops of log(mean((d - y)^2 / (stopgrad(d)^2 + 0.01)) + 1e-3), outliers saturated.
+    """Mean over crops of log(mean(relative_error) + 1e-3), outliers saturated.
 
     The logarithm gives an easy crop and a hard one the same say, as the geometric mean over scenes does.
     """
-    error = (prediction - target).square() / (prediction.detach().square() + EPSILON)
+    error = relative_error(prediction, target)
     error = error / (1 + error.detach() / OUTLIER)
-    return torch.log(error.mean((1, 2, 3)) + 1e-3).mean()
+    return torch.log(error.mean((1, 2, 3)) + LOG_FLOOR).mean()
+
+
+def tone_map(picture: Tensor) -> Tensor:
+    """sRGB transfer function of log(1 + max(x, 0)), not clamped above."""
+    y = torch.log1p(picture.clamp_min(0))
+    curve = SRGB_SCALE * y.clamp_min(SRGB_LINEAR) ** (1 / SRGB_POWER) - SRGB_OFFSET
+    return torch.where(y <= SRGB_LINEAR, SRGB_SLOPE * y, curve)
+
+
+def tone_mapped(prediction: Tensor, target: Tensor) -> Tensor:
+    """Mean squared error of the tone-mapped pictures."""
+    return (tone_map(prediction) - tone_map(target)).square().mean()
+
+
+def tonemapped_l2(prediction: Tensor, target: Tensor) -> Tensor:
+    """(T(d) - T(y))^2 with T(x) = x / (1 + x), mean over everything; below 0 counts as 0."""
+    d, y = prediction.clamp_min(0), target.clamp_min(0)
+    return (d / (1 + d) - y / (1 + y)).square().mean()
 
 
 def total_loss(prediction: Tensor, target: Tensor, weights: LossWeights) -> Tensor:
-    """The weighted sum; prediction and target (B, 3, H, W) in the common scale."""
-    loss = weights.smape * smape(prediction, target) + weights.relative * log_relative(prediction, target)
+    """The weighted sum, a scalar; prediction and target (B, 3, H, W) in the common scale."""
+    loss = prediction.new_zeros(())
+    for term in (smape, noise2noise, tone_mapped):
+        weight = getattr(weights, term.__name__)
+        if weight:
+            loss = loss + weight * term(prediction, target)
+    if weights.relative:
+        loss = loss + weights.relative * log_relative(prediction, target)
+    if weights.tonemapped:
+        loss = loss + weights.tonemapped * tonemapped_l2(prediction, target)
     for size, weight in weights.pooled:
         loss = loss + weight * smape(F.avg_pool2d(prediction, size), F.avg_pool2d(target, size))
     return loss
