@@ -74,12 +74,6 @@ def tone_mapped(prediction: Tensor, target: Tensor) -> Tensor:
     return (tone_map(prediction) - tone_map(target)).square().mean()
 
 
-def tonemapped_l2(prediction: Tensor, target: Tensor) -> Tensor:
-    """(T(d) - T(y))^2 with T(x) = x / (1 + x), mean over everything; below 0 counts as 0."""
-    d, y = prediction.clamp_min(0), target.clamp_min(0)
-    return (d / (1 + d) - y / (1 + y)).square().mean()
-
-
 def total_loss(prediction: Tensor, target: Tensor, weights: LossWeights) -> Tensor:
     """The weighted sum, a scalar; prediction and target (B, 3, H, W) in the common scale."""
     loss = prediction.new_zeros(())
@@ -89,8 +83,6 @@ def total_loss(prediction: Tensor, target: Tensor, weights: LossWeights) -> Tens
             loss = loss + weight * term(prediction, target)
     if weights.relative:
         loss = loss + weights.relative * log_relative(prediction, target)
-    if weights.tonemapped:
-        loss = loss + weights.tonemapped * tonemapped_l2(prediction, target)
     for size, weight in weights.pooled:
         loss = loss + weight * smape(F.avg_pool2d(prediction, size), F.avg_pool2d(target, size))
     return loss
