@@ -33,6 +33,9 @@ def denoise(**choices: Any) -> int:
     2 usage or refused output, 3 IN unreadable or unsuitable.
     """
     options = build_options(DenoiseOptions, **job_choices(**choices))
+    from pipelines.frames import find_frames
+
+    find_frames(options)  # a missing input is said at once, not after the import of torch
     from pipelines.denoise import denoise_frames
 
     return end_job(denoise_frames(options))

@@ -50,6 +50,9 @@ def export_layers(**choices: Any) -> int:
     codes are those of denoise.
     """
     options = build_options(ExportOptions, **job_choices(**choices))
+    from pipelines.frames import find_frames
+
+    find_frames(options)  # a missing input is said at once, not after the import of torch
     from pipelines.export import export_frames
 
     return end_job(export_frames(options))

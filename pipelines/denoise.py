@@ -28,6 +28,7 @@ from model.denoiser import Denoiser
 from model.features import FrameScale
 from pipelines import __version__
 from pipelines.aovs import Aovs, beauty_channels, find_aovs
+from pipelines.frames import exposure_frame, find_frames
 from pipelines.ids import IdChannel, find_ids, ranked_ids
 from pipelines.inference import FrameLayers, denoise_bands
 from pipelines.jobs import FrameSkippedError, JobReport, run_frames
@@ -112,6 +113,7 @@ class Job:
             raise UsageError(f"--layers {options.layers}: {self.weights.name} has up to "
                              f"{self.net.config.partition_logits}")
         self.shot: Shot | None = None
+        self.key: Survey | None = None
         self.sources: list[Path] = []
 
     def open(self, source: Path) -> SampleReader:
@@ -169,8 +171,7 @@ class Job:
     def _decide(self, source: Path, seen: Survey, weighting: str) -> Shot:
         """The shot's scale, both numbers of it, comes from one frame: chunks of a shot that name it agree exactly."""
         options = self.options
-        key = self._first_survey(source, seen) if options.exposure_from is None else self._survey_of(
-            options.exposure_from)
+        key = self.key or self._first_survey(source, seen)
         scale = FrameScale(options.exposure or key.exposure, key.depth)
         needed = self.net.config.layers
         if options.adapt and key.mixed is not None and key.mixed < FEW_MIXED:
@@ -181,13 +182,11 @@ class Job:
         """That of the job's first readable frame: a job resumed past frames that exist decides as it did at first."""
         for earlier in self.sources[:self.sources.index(source)] if source in self.sources else ():
             with suppress(LbmcError):
-                return self._survey_of(os.fspath(earlier))
+                return self.survey_of(earlier)
         return seen
 
-    def _survey_of(self, frame: str) -> Survey:
-        source = Path(frame)
-        if frame.lstrip("-").isdigit() and not source.exists():
-            source = sequences.frame_path(self.options.source, int(frame))
+    def survey_of(self, source: Path) -> Survey:
+        """What another frame of the shot is like. Raises LbmcError."""
         with self.open(source) as reader:
             return survey(reader.blocks())
 
@@ -282,13 +281,16 @@ def denoise_frames(options: DenoiseOptions) -> JobReport[DenoisedFrame]:
 
 def run_job(kind: type[Job], options: DenoiseOptions) -> JobReport[DenoisedFrame]:
     """Runs a job of some kind on the frames that its options name; raises what `denoise_frames` does."""
-    frames = sequences.pair(options.source, options.target, options.frames)
+    frames = find_frames(options)
     job = kind(options)
     job.sources = [frame.source for frame in frames]
+    to_do = options.dry_run
     if not options.dry_run:
         for frame in frames:  # a refused output is found before hours of work, not after
             for target in job.targets(frame):
-                output_action(target, [other.source for other in frames], options.existing)
+                to_do |= output_action(target, [other.source for other in frames], options.existing)
+    if to_do and (key := exposure_frame(options)) is not None:
+        job.key = job.survey_of(key)  # all frames depend on it: what is wrong with it fails the job, once
     progress = make_progress(options.progress, len(frames))
     with progress:
         return run_frames(frames, job.frame, progress, str)

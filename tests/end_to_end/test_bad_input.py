@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import pytest
 
 from deep_io import DeepSamples, Window, write_deep
 from tests.end_to_end.scenes import changed, noisy_scene, random_weights, write_scene
-from tests.runner import Finished, Runner, in_process, installed
+from tests.runner import Finished, Runner, environment, in_process, installed
 
 SMALL = Window(0, 0, 15, 11)
 
@@ -167,6 +169,42 @@ def test_frames_that_are_missing_are_listed(weights: Path, tmp_path: Path) -> No
         write_scene(tmp_path / f"in.{number:04d}.exr", small())
     words = ("denoise", tmp_path / "in.####.exr", tmp_path / "out.####.exr", "--model", weights, "--frames", "1-4")
     assert_refused(in_process(*words), tmp_path / "out.0001.exr", "2 of 4 frames are missing", "2,4")
+
+
+def test_a_missing_input_is_said_without_the_seconds_that_torch_takes_to_import(tmp_path: Path) -> None:
+    code = f"""
+import sys
+from lbmc_cli.main import main
+for command in ("denoise", "export-layers"):
+    assert main([command, {str(tmp_path / "none.exr")!r}, {str(tmp_path / "out.exr")!r}]) == 3
+print("torch" in sys.modules)
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment(), check=True)
+    assert run.stderr.count("none.exr: no such file") == 2
+    assert run.stdout == "False\n"
+
+
+@pytest.mark.parametrize(("frame", "code", "words"), [
+    ("9", 3, ("in.0009.exr", "no such file")),
+    ("none.exr", 3, ("none.exr", "no such file")),
+    ("flat.exr", 3, ("flat.exr", "is a flat EXR")),
+])
+def test_a_bad_exposure_frame_fails_the_job_once_and_before_the_work(
+    frame: str, code: int, words: tuple[str, ...], weights: Path, tmp_path: Path
+) -> None:
+    for number in (1, 2):
+        write_scene(tmp_path / f"in.{number:04d}.exr", small())
+    flat(tmp_path / "flat.exr")
+    run = in_process("denoise", "in.####.exr", "out.####.exr", "--model", weights, "--exposure-from", frame,
+                     cwd=tmp_path)
+    assert_refused(run, tmp_path / "out.0001.exr", *words, code=code)
+    assert "Progress" not in run.err
+
+
+def test_a_bare_number_as_exposure_frame_needs_a_numbered_input(weights: Path, tmp_path: Path) -> None:
+    source = write_scene(tmp_path / "in.exr", small())
+    run = in_process("denoise", source, tmp_path / "out.exr", "--model", weights, "--exposure-from", "9")
+    assert_refused(run, tmp_path / "out.exr", "--exposure-from 9", "no frame number", code=2)
 
 
 def test_weights_that_do_not_exist_are_a_usage_error_that_lists_the_presets(tmp_path: Path) -> None:
