@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from model.chunks import Chunk, Index, chunks, together
 from model.compositing import Layers, composite, fill_holes, to_layers
 from model.config import Config
 from model.direct import filter_direct, make_generators, splat_samples
@@ -40,8 +41,8 @@ from model.partition import (
 from model.reach import influence
 from model.reducer import LogFeatures, SampleReducer, context_inputs, pixel_rows
 from model.samples import Samples, Segments
+from model.targets import cells_with, sources_of
 
-CHUNK_SAMPLES = 32768  # per-sample stages at inference: about 4 MB of activations at width 32
 CONFIDENCE_START = -3.0  # softplus(-3) = 0.05: nearly unbiased at the start
 OUTLIER_RATE_START = -1.5  # softplus(-1.5) = 0.2: what each log unit beyond OUTLIER_START adds to gamma
 
@@ -112,7 +113,8 @@ class Denoiser(nn.Module):
         """Tiles start at multiples of this many pixels, so that pooling cells and levels coincide."""
         return max(self.config.unet.stride, 1 << (len(self.config.kernel_sizes) - 1))
 
-    def forward(self, samples: Samples, scale: FrameScale, layers: int | None = None, fill: bool = True) -> Layers:
+    def forward(self, samples: Samples, scale: FrameScale, layers: int | None = None, fill: bool = True,
+                wanted: Tensor | None = None) -> Layers:
         """Denoises a batch of pictures.
 
         Parameters
@@ -121,6 +123,8 @@ class Denoiser(nn.Module):
         scale : the frame's (or shot's), measured over the whole frame
         layers : 1 to `config.partition_logits`; default `config.layers`
         fill : fill targets that no sample reaches (`fill_holes`); a caller with tiles does that for the whole frame
+        wanted : (B, H, W) bool; pixels whose result will be used, at least one. What is computed of the others is not
+            said; all samples count all the same. None: every pixel
 
         Returns
         -------
@@ -136,7 +140,9 @@ class Denoiser(nn.Module):
         elif config.kernel == "direct":
             visible = self._filter_direct(samples, embedding, relative, contexts, context, scale, keep)
         else:
-            visible = self._filter_affinity(samples, embedding, relative, context, scale, keep)
+            if torch.is_grad_enabled() or (wanted is not None and bool(wanted.all())):
+                wanted = None
+            visible = self._filter_affinity(samples, embedding, relative, context, scale, keep, wanted)
         result = to_layers(visible)
         return fill_holes(result) if fill else result
 
@@ -149,10 +155,11 @@ class Denoiser(nn.Module):
         contexts, _ = self._context(samples, relative, scale)
         context = _rows(contexts[0], samples.shape)
         shares = []
-        for part, rows, part_relative in _chunks(samples, relative):
-            embedding = self.reducer(part, scale)
-            shares.append(self._partition(part, embedding, part_relative, context[rows], scale, keep)[0].exp())
-        return torch.cat(shares, 0)
+        for part in chunks(samples, relative):
+            embedding = self.reducer(part.samples, scale)
+            log_partition, _ = self._partition(part, embedding, context[part.pixels], scale, keep)
+            shares.append((part.own, log_partition.exp()))
+        return together(shares, len(samples.weight))
 
     def _surroundings(self, samples: Samples, scale: FrameScale) -> Tensor | None:
         """(N, 1 or 2) each sample against its neighbourhood: depth (0: unknown), then radiance; None for neither."""
@@ -170,11 +177,11 @@ class Denoiser(nn.Module):
     def _context(self, samples: Samples, relative: Tensor | None, scale: FrameScale) -> tuple[list[Tensor], Tensor]:
         """Context pictures, finest first, of the size padded to the stride; the embeddings (n, E) of the last chunk."""
         rows = []
-        for part, _, part_relative in _chunks(samples, relative):
-            embedding = self.reducer(part, scale)
-            rows.append(pixel_rows(part, embedding, part_relative, scale, self.config))
+        for part in chunks(samples, relative):
+            embedding = self.reducer(part.samples, scale)
+            rows.append((part.pixels, pixel_rows(part.samples, embedding, part.relative, scale, self.config)))
         batch, height, width = samples.shape
-        picture = torch.cat(rows, 0).view(batch, height, width, -1).permute(0, 3, 1, 2)  # channels last in memory
+        picture = together(rows, samples.counts.numel()).view(batch, height, width, -1).permute(0, 3, 1, 2)  # channels last in memory
         stride = self.config.unet.stride
         padded = F.pad(picture, (0, -width % stride, 0, -height % stride))
         return [level.to(picture.dtype) for level in reversed(self.unet.levels(padded))], embedding
@@ -182,21 +189,22 @@ class Denoiser(nn.Module):
     # --- samples to layers -----------------------------------------------------------------------------------------
 
     def _splat_chunks(self, samples: Samples, embedding: Tensor, relative: Tensor | None, context: Tensor,
-                      scale: FrameScale, keep: list[int]) -> Iterator[tuple[slice, Tensor]]:
+                      scale: FrameScale, keep: list[int], sources: Tensor | None = None
+                      ) -> Iterator[tuple[Index, Tensor]]:
         """Rows of pixels and their splat, chunk by chunk; `embedding` is used if it is that of all samples."""
-        for part, rows, part_relative in _chunks(samples, relative):
-            if len(part.weight) < len(samples.weight):  # of several chunks: cheaper to repeat than to keep
-                embedding = self.reducer(part, scale)
-            yield rows, self._splat(part, embedding, part_relative, context[rows], scale, keep)
+        for part in chunks(samples, relative, sources):
+            if part.samples is not samples:  # of several chunks: cheaper to repeat than to keep
+                embedding = self.reducer(part.samples, scale)
+            yield part.pixels, self._splat(part, embedding, context[part.pixels], scale, keep)
 
-    def _splat(self, samples: Samples, embedding: Tensor, relative: Tensor | None, context: Tensor, scale: FrameScale,
-               keep: list[int]) -> Tensor:
+    def _splat(self, part: Chunk, embedding: Tensor, context: Tensor, scale: FrameScale, keep: list[int]) -> Tensor:
         """(P, L, K) rows: log n, log w, then per unit of occupancy basic values, guides if needed, embedding, extra."""
+        samples = part.samples
         segments = Segments(samples.counts)
         log_weight = torch.log(samples.weight[:, None])
         log_partition = torch.zeros_like(log_weight)
         if self.config.layered:
-            log_partition, loss = self._partition(samples, embedding, relative, context, scale, keep)
+            log_partition, loss = self._partition(part, embedding, context, scale, keep)
             log_weight = log_weight - loss
         values = [basic_values(samples, scale)]
         if self.config.kernel == "affinity":
@@ -207,9 +215,10 @@ class Denoiser(nn.Module):
         result = splat(log_weight, log_partition, torch.cat(values, 1), segments)
         return torch.cat([result.log_n[..., None], result.log_w[..., None], result.values], 2)
 
-    def _partition(self, samples: Samples, embedding: Tensor, relative: Tensor | None, context: Tensor,
-                   scale: FrameScale, keep: list[int]) -> tuple[Tensor, Tensor | float]:
+    def _partition(self, part: Chunk, embedding: Tensor, context: Tensor, scale: FrameScale, keep: list[int]
+                   ) -> tuple[Tensor, Tensor | float]:
         """(N, L) log of the partition, and what the confidence takes from the log of each weight, (N, 1)."""
+        samples, relative = part.samples, part.relative
         config = self.config
         mine = embedding if relative is None else torch.cat([embedding, relative.to(embedding.dtype)], 1)
         shared = Segments(samples.counts).expand(self.partitioner.first(0, context))
@@ -229,50 +238,41 @@ class Denoiser(nn.Module):
     # --- kernels, filter, compositing ------------------------------------------------------------------------------
 
     def _filter_affinity(self, samples: Samples, embedding: Tensor, relative: Tensor | None, context: Tensor,
-                         scale: FrameScale, keep: list[int]) -> Tensor:
+                         scale: FrameScale, keep: list[int], wanted: Tensor | None) -> Tensor:
         """(B, L, 6 + E, H, W) visible planes."""
         planes, predictions = [], []
-        for rows, part in self._splat_chunks(samples, embedding, relative, context, scale, keep):
+        sources = active = None
+        if wanted is not None:
+            sources = sources_of(wanted, self.config.kernel_sizes).flatten()
+            active = cells_with(wanted, ACTIVE_CELL).repeat_interleave(len(keep), 0)
+        for rows, part in self._splat_chunks(samples, embedding, relative, context, scale, keep, sources):
             end = GUIDED_COLUMNS + self.config.embedding
-            predictions.append(predict(self.generator, self.layer_bias[keep], part[..., :end], context[rows]))
+            predictions.append((rows, predict(self.generator, self.layer_bias[keep], part[..., :end], context[rows])))
             # the embedding has done its work
-            planes.append(torch.cat([part[..., :GUIDED_COLUMNS], part[..., end:]], -1))
-        splats, predicted = (_picture(parts, samples.shape).flatten(0, 1) for parts in (planes, predictions))
-        means = filter_guided(splats, predicted, self.guide_matrix, self.config, scale, samples.lights)
+            planes.append((rows, torch.cat([part[..., :GUIDED_COLUMNS], part[..., end:]], -1)))
+        empty = planes[0][1].new_zeros(planes[0][1].shape[-1])
+        empty[:2] = -torch.inf  # log n, log w: where no kernel looks there may as well be nothing
+        splats = _picture(together(planes, samples.counts.numel(), empty), samples.shape).flatten(0, 1)
+        predicted = _picture(together(predictions, samples.counts.numel()), samples.shape).flatten(0, 1)
+        means = filter_guided(splats, predicted, self.guide_matrix, self.config, scale, samples.lights, active)
         return composite(means.view(samples.shape[0], len(keep), *means.shape[1:]))
 
     def _filter_direct(self, samples: Samples, embedding: Tensor, relative: Tensor | None, contexts: list[Tensor],
                        context: Tensor, scale: FrameScale, keep: list[int]) -> Tensor:
         """(B, L, 6 + E, H, W) visible planes."""
-        planes = [part for _, part in self._splat_chunks(samples, embedding, relative, context, scale, keep)]
+        planes = together(list(self._splat_chunks(samples, embedding, relative, context, scale, keep)),
+                          samples.counts.numel())
         return filter_direct(_picture(planes, samples.shape), contexts, self.generators, self.config)
 
     def _splat_samples(self, samples: Samples, embedding: Tensor, context: Tensor, scale: FrameScale) -> Tensor:
         """(B, 1, 6 + E, H, W) visible planes."""
         if len(embedding) < len(samples.weight):
-            embedding = torch.cat([self.reducer(part, scale) for part, _, _ in _chunks(samples, None)], 0)
+            parts = [(part.own, self.reducer(part.samples, scale)) for part in chunks(samples, None)]
+            embedding = together(parts, len(samples.weight))
         generator = self.generators[0]
         assert isinstance(generator, Mlp)
         values = torch.cat([basic_values(samples, scale), *extra_values(samples)], 1)
         return splat_samples(samples, values, embedding, context, generator)
-
-
-def _chunks(samples: Samples, relative: Tensor | None) -> Iterator[tuple[Samples, slice, Tensor | None]]:
-    """Pixel ranges of about CHUNK_SAMPLES samples; one range when a gradient is wanted."""
-    pixels = samples.counts.numel()
-    total = samples.weight.numel()
-    if torch.is_grad_enabled() or total <= CHUNK_SAMPLES:
-        yield samples, slice(0, pixels), relative
-        return
-    ends = samples.counts.long().cumsum(0)
-    first = start = 0
-    while first < pixels:
-        last = int(torch.searchsorted(ends, start + CHUNK_SAMPLES, right=True))
-        last = min(max(last, first + 1), pixels)
-        stop = int(ends[last - 1])
-        part = samples.pixel_range(first, last, start, stop)
-        yield part, slice(first, last), None if relative is None else relative[start:stop]
-        first, start = last, stop
 
 
 def _rows(picture: Tensor, shape: tuple[int, int, int]) -> Tensor:
@@ -281,9 +281,8 @@ def _rows(picture: Tensor, shape: tuple[int, int, int]) -> Tensor:
     return picture[..., :height, :width].permute(0, 2, 3, 1).reshape(batch * height * width, -1)
 
 
-def _picture(rows: list[Tensor], shape: tuple[int, int, int]) -> Tensor:
-    """(P, L, K) in pieces -> (B, L, K, H, W)."""
-    whole = torch.cat(rows, 0) if len(rows) > 1 else rows[0]
+def _picture(whole: Tensor, shape: tuple[int, int, int]) -> Tensor:
+    """(P, L, K) -> (B, L, K, H, W)."""
     batch, height, width = shape
     return whole.view(batch, height, width, *whole.shape[1:]).permute(0, 3, 4, 1, 2).contiguous()
 

@@ -16,6 +16,7 @@ from model.samples import ROLE_WIDTHS, Samples
 
 DEPTH_LIMIT = 8.0  # |log(z / median)| beyond this carries no more information
 SQUASH_PIXELS = 4.0  # half of the range of x / (SQUASH + |x|) is reached at this many pixels
+PRODUCTS = (("coc", "lens"), ("motion", "time"))  # of roles, as features of their own; two wide
 DIVISOR_FLOOR = 0.03  # surfaces darker than this are not demodulated
 
 
@@ -55,11 +56,15 @@ def feature_groups(roles: Iterable[str], derived: bool) -> dict[str, int]:
     groups = {role: ROLE_WIDTHS[role] for role in roles}
     if derived:
         groups["coverage"] = 1
-        if "coc" in roles and "lens" in roles:
-            groups["coc*lens"] = 2
-        if "motion" in roles and "time" in roles:
-            groups["motion*time"] = 2
+        groups |= {f"{a}*{b}": 2 for a, b in PRODUCTS if a in roles and b in roles}
     return groups
+
+
+def held_groups(samples: Samples) -> set[str]:
+    """The groups whose features are 0 because a role is held: the role's own and its products."""
+    there = {*samples.roles, *samples.held}
+    products = {f"{a}*{b}" for a, b in PRODUCTS if {a, b} <= there and {a, b} & samples.held}
+    return {*samples.held, *products}
 
 
 def encode(samples: Samples, scale: FrameScale, groups: Iterable[str]) -> dict[str, Tensor]:

@@ -91,8 +91,10 @@ def predict(generator: Mlp, layer_bias: Tensor, planes: Tensor, context: Tensor)
 
 
 def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Parameter, config: Config, scale: FrameScale,
-                  lights: int) -> Tensor:
+                  lights: int, active: Tensor | None = None) -> Tensor:
     """Filters each layer by affinity, radiance along two paths if `config.demodulation`.
+
+    active : which cells of targets are computed, see `affinity_filter`
 
     planes (B*L, K, H, W): GUIDED_COLUMNS, extra values and, with demodulation, the first `lights` of them demodulated;
     predictions (B*L, sum(generator_sizes), H, W) -> (B*L, 6 + E, H, W) per unit of filtered occupancy: radiance,

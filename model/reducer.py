@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from model.config import Config
-from model.features import FrameScale, encode, feature_groups, log_radiance
+from model.features import FrameScale, encode, feature_groups, held_groups, log_radiance
 from model.networks import Mlp
 from model.samples import Samples, Segments
 
@@ -16,7 +16,8 @@ LUMINANCE_LIMIT = 1e18  # its square must stay in the range of float32
 
 
 class SampleReducer(nn.Module):
-    """Samples -> embeddings (N, E). A role that is absent leaves the first layer; a present one adds its own bias."""
+    """Samples -> embeddings (N, E). A role that is absent leaves the first layer; a present one adds its own bias, and
+    of a held one nothing but that is left."""
 
     def __init__(self, config: Config) -> None:
         super().__init__()
@@ -32,7 +33,8 @@ class SampleReducer(nn.Module):
 
     def forward(self, samples: Samples, scale: FrameScale) -> Tensor:
         features = encode(samples, scale, self.groups)
-        present = [k for k, name in enumerate(self.groups) if name in features]
+        there = {*features, *held_groups(samples)}
+        present = [k for k, name in enumerate(self.groups) if name in there]
         columns = [c for name in self.groups if name in features for c in range(*self.spans[name])]
         first = self.mlp.groups[0]
         assert isinstance(first, nn.Linear)
@@ -88,7 +90,8 @@ def pixel_rows(
     mean = segments.weighted_sum(weight, moments)[:, 0]
     deviation = moments - segments.expand(mean)
     variance = segments.weighted_sum(weight, deviation * deviation)[:, 0]
-    concentration = segments.sum(weight * weight)
+    squares = weight * weight if samples.squares is None else samples.squares[:, None]
+    concentration = segments.sum(squares)
     count = torch.log2(torch.where(concentration > 0, concentration, 1)) * -0.25
     e = embedding.shape[1]
     return torch.cat(

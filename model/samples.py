@@ -97,6 +97,9 @@ class Samples:
     roles : role -> (N, width) float32, see ROLE_WIDTHS; "radiance" always, linear, any scale
     extra : (N, E) values to filter by the radiance's own partition and kernels; never features. None: there are none
     lights : how many of its first columns are parts of the radiance, filtered along the demodulated path too
+    squares : (N,) what each sample adds to the sum of squared weights of its pixel, which tells how noisy it is; None:
+        the square of its weight. One that stands for several alike has theirs
+    held : roles that are known to say nothing, such as motion where nothing moves: present, with features of 0
     """
 
     shape: tuple[int, int, int]
@@ -106,6 +109,8 @@ class Samples:
     roles: dict[str, Tensor]
     extra: Tensor | None = None
     lights: int = 0
+    squares: Tensor | None = None
+    held: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         batch, height, width = self.shape
@@ -126,12 +131,21 @@ class Samples:
 
     def pixel_range(self, first: int, last: int, start: int, stop: int) -> Samples:
         """Pixels first..last (exclusive), whose samples are start..stop, as one image row."""
+        return self._part(slice(first, last), slice(start, stop), last - first)
+
+    def picked(self, pixels: Tensor, index: Tensor) -> Samples:
+        """Pixels by number, whose samples are `index`, as one image row."""
+        return self._part(pixels, index, len(pixels))
+
+    def _part(self, pixels: slice | Tensor, own: slice | Tensor, count: int) -> Samples:
         return Samples(
-            (1, 1, last - first),
-            self.counts[first:last],
-            self.weight[start:stop],
-            self.coverage[start:stop],
-            {role: values[start:stop] for role, values in self.roles.items()},
-            None if self.extra is None else self.extra[start:stop],
+            (1, 1, count),
+            self.counts[pixels],
+            self.weight[own],
+            self.coverage[own],
+            {role: values[own] for role, values in self.roles.items()},
+            None if self.extra is None else self.extra[own],
             self.lights,
+            None if self.squares is None else self.squares[own],
+            self.held,
         )

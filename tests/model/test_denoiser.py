@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from model import denoiser, direct
+from model import chunks, direct
 from model.compositing import Layers
 from model.denoiser import Denoiser
 from model.features import FrameScale
@@ -199,7 +199,7 @@ def test_memory_budget_changes_nothing(variant: str, monkeypatch: pytest.MonkeyP
     samples = random_samples(8, (2, 17, 13), counts, dtype=torch.float32)
     expected = net(samples, SCALE)  # with a gradient: one chunk
     expected = Layers(*(getattr(expected, field.name).detach() for field in dataclasses.fields(Layers)))
-    monkeypatch.setattr(denoiser, "CHUNK_SAMPLES", 50)
+    monkeypatch.setattr(chunks, "CHUNK_SAMPLES", 50)
     monkeypatch.setattr(direct, "BLOCK_LOGITS", 3000)
     assert_same(expected, run(net, samples), 1e-5)
 

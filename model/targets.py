@@ -1,0 +1,27 @@
+"""Which targets a caller wants, as pixels: the cells that hold them, and the sources that their kernels look at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def cells_with(wanted: Tensor, size: int) -> Tensor:
+    """(B, H, W) bool -> (B, ceil(H / size), ceil(W / size)) bool: whether a cell holds any wanted pixel."""
+    return F.max_pool2d(wanted[:, None].float(), size, ceil_mode=True)[:, 0] > 0
+
+
+def sources_of(wanted: Tensor, windows: Sequence[int]) -> Tensor:
+    """(B, H, W) bool -> (B, H, W) bool: the pixels that affinity kernels of the wanted targets reach.
+
+    windows : odd size of the kernel at each level, in cells of 2**level pixels
+    """
+    height, width = wanted.shape[-2:]
+    seen = wanted
+    for level, window in enumerate(windows):
+        size = 2**level
+        cells = F.max_pool2d(cells_with(wanted, size).float(), window, 1, window // 2) > 0
+        seen = seen | cells.repeat_interleave(size, -2).repeat_interleave(size, -1)[..., :height, :width]
+    return seen
