@@ -1,6 +1,6 @@
 """The names that renderers give to what lbmc calls roles: one row per layer name, facts only, no logic.
 
-A row says which role a layer plays, in which space its normals are and what its depth measures. `deep_io.roles`
+A row says which role a layer plays, in which space its normals are and what its depth measures. `role_matching.py`
 does the matching. A layer whose convention is not documented well enough to convert has no row on purpose: a role
 that is missing costs a little quality, a role that is wrong costs the picture.
 """

@@ -19,7 +19,8 @@ from deep_io.csr import Index, offsets_of, pixels_of
 from deep_io.errors import InputError, UsageError
 from deep_io.header import Header
 from deep_io.over import decode_over
-from deep_io.roles import ROLES, RoleMap, map_roles
+from deep_io.role_matching import map_roles
+from deep_io.roles import ROLES, RoleMap
 from deep_io.samples import DeepSamples, Window
 from deep_io.weighting import (
     ATTRIBUTE,

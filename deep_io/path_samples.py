@@ -58,7 +58,7 @@ class SampleReader:
     Parameters
         path       the file
         part       name or index of the deep part; None for the only one
-        overrides  role -> layer, see roles.map_roles
+        overrides  role -> layer, see role_matching.map_roles
         weighting  "uniform", "packed" or "over"; None: the header's lbmc:weighting, else uniform as long as every
                    alpha is 0 or 1
         normals, depth, camera   see conventions.resolve; camera also as the text of `--camera`

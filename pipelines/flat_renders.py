@@ -17,7 +17,8 @@ from deep_io.attributes import Attribute
 from deep_io.errors import InputError
 from deep_io.flat import FlatImage, read_flat_parts
 from deep_io.header import Header, channels_of
-from deep_io.roles import RoleMap, map_roles
+from deep_io.role_matching import map_roles
+from deep_io.roles import RoleMap
 from deep_io.samples import DeepSamples, Window
 
 PathLike = str | os.PathLike[str]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from deep_io.errors import InputError, UsageError
-from deep_io.roles import ROLES, map_roles, renderer_of
+from deep_io.role_matching import map_roles, renderer_of
+from deep_io.roles import ROLES
 
 CANONICAL = [name for role in ROLES.values() for name in role.channels]
 

@@ -8,7 +8,8 @@ import pytest
 from deep_io import Header, InputError, Window
 from deep_io.attributes import attribute
 from deep_io.header import channels_of
-from deep_io.roles import MISS_DEPTH, map_roles
+from deep_io.role_matching import map_roles
+from deep_io.roles import MISS_DEPTH
 from pipelines.aovs import Aov, Aovs, beauty_channels, find_aovs
 from pipelines.inference import FrameLayers
 
