@@ -18,7 +18,6 @@ from pipelines.options import COMPRESSIONS, DenoiseOptions
 @job_options
 @option(
     "--keep",
-    "--channels",
     "keep",
     multiple=True,
     metavar="NAME",

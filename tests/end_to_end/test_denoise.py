@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -140,10 +141,10 @@ def test_an_existing_output_is_refused_kept_or_replaced(weights: Path, tmp_path:
 
 
 @pytest.mark.parametrize("link", [os.symlink, os.link])
-def test_an_input_is_never_written_over(link: object, weights: Path, tmp_path: Path) -> None:
+def test_an_input_is_never_written_over(link: Callable[[Path, Path], None], weights: Path, tmp_path: Path) -> None:
     source = write_scene(tmp_path / "in.exr", noisy_scene(3, TINY))
     before = source.read_bytes()
-    link(source, tmp_path / "link.exr")  # type: ignore[operator]
+    link(source, tmp_path / "link.exr")
     for output in (source, tmp_path / "link.exr"):
         run = in_process("denoise", source, output, "--model", weights, "--overwrite")
         assert run.code == 2

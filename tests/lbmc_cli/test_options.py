@@ -21,12 +21,14 @@ def parsed(monkeypatch: pytest.MonkeyPatch) -> Any:
 
     def parse(*arguments: str, env: dict[str, str] | None = None) -> DenoiseOptions:
         import pipelines.denoise
+        import pipelines.frames
         from pipelines.jobs import JobReport
 
         def catch(options: DenoiseOptions) -> JobReport[None]:
             caught.append(options)
             return JobReport(())
 
+        monkeypatch.setattr(pipelines.frames, "find_frames", lambda options: [])
         monkeypatch.setattr(pipelines.denoise, "denoise_frames", catch)
         result = CliRunner().invoke(program, ["denoise", "in.exr", "out.exr", *arguments], env=env)
         assert result.exit_code == 0, result.output
@@ -44,7 +46,7 @@ def test_every_flag_reaches_its_option(parsed: Any) -> None:
         "--frames 1-5 --skip-existing --force --part 1 --map normal=Nw --map depth=Zc --weighting over --normals world "
         "--depth distance --camera cam.exr --model fast --layers 3 --no-adapt --exposure 2.5 --dry-run "
         "--device cuda:1 --threads 3 --memory 1.5GiB --precision bf16 --pixel-type float --compression dwaa "
-        "--keep id --channels light_* --progress openjd"
+        "--keep id --keep light_* --progress openjd"
     )
     assert parsed(*words.split()) == DenoiseOptions(
         "in.exr",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,9 +19,9 @@ UNET = UNetConfig(
 HALF_UNET = UNetConfig(encoder=((5, 5), (6,)), bottleneck=(6,), decoder=((6,), (6, 5)), scale=2)
 
 
-def _small(name: str, kernel_sizes: tuple[int, ...], **changes: object) -> Config:
+def _small(name: str, kernel_sizes: tuple[int, ...], **changes: Any) -> Config:
     config = CONFIGS[name]
-    small = {
+    small: dict[str, Any] = {
         "unet": HALF_UNET if config.unet.scale == 2 else UNET,
         "kernel_sizes": kernel_sizes,
         "reducer": (6, 5) if config.reducer else (),
@@ -28,7 +29,7 @@ def _small(name: str, kernel_sizes: tuple[int, ...], **changes: object) -> Confi
         "generator": (7,),
         **changes,
     }
-    return replace(config, **small)  # type: ignore[arg-type]
+    return replace(config, **small)
 
 
 _ABLATION = {"statistics": True, "depth_prior": True, "confidence": True, "encoding": "log", "partition_logits": 3}

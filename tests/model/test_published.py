@@ -41,7 +41,9 @@ class Plain:
         order = torch.cat([features[role] for role in net.config.roles], 1)  # (N, 20)
         self.weight = samples.weight[:, None]
         if net.config.reducer:
-            self.embedding = F.leaky_relu(mlp(net.reducer.mlp, order), 0.01)  # type: ignore[arg-type]
+            reducer = net.reducer.mlp
+            assert isinstance(reducer, Mlp)
+            self.embedding = F.leaky_relu(mlp(reducer, order), 0.01)
             inputs = self.per_pixel(self.weight * self.embedding)
         else:
             self.embedding = order

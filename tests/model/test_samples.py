@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -35,12 +36,12 @@ def test_reductions_equal_a_loop_over_pixels(counts: list[int]) -> None:
     torch.testing.assert_close(segments.expand(numbered), numbered.repeat_interleave(torch.tensor(counts), 0))
 
 
-def samples(**changes: object) -> Samples:
-    fields: dict[str, object] = {
+def samples(**changes: Any) -> Samples:
+    fields: dict[str, Any] = {
         "shape": (1, 1, 2), "counts": torch.tensor([1, 2]), "weight": torch.tensor([1.0, 0.5, 0.5]),
         "coverage": torch.ones(3), "roles": {"radiance": torch.ones(3, 3)},
     }
-    return Samples(**{**fields, **changes})  # type: ignore[arg-type]
+    return Samples(**{**fields, **changes})
 
 
 @pytest.mark.parametrize(
