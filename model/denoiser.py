@@ -41,7 +41,7 @@ from model.partition import (
 from model.reach import influence
 from model.reducer import LogFeatures, SampleReducer, context_inputs, pixel_rows
 from model.samples import Samples, Segments
-from model.targets import cells_with, sources_of
+from model.targets import TARGET_CELL, cells_with, sources_of
 
 CONFIDENCE_START = -3.0  # softplus(-3) = 0.05: nearly unbiased at the start
 OUTLIER_RATE_START = -1.5  # softplus(-1.5) = 0.2: what each log unit beyond OUTLIER_START adds to gamma
@@ -181,7 +181,8 @@ class Denoiser(nn.Module):
             embedding = self.reducer(part.samples, scale)
             rows.append((part.pixels, pixel_rows(part.samples, embedding, part.relative, scale, self.config)))
         batch, height, width = samples.shape
-        picture = together(rows, samples.counts.numel()).view(batch, height, width, -1).permute(0, 3, 1, 2)  # channels last in memory
+        picture = together(rows, samples.counts.numel()).view(batch, height, width, -1)
+        picture = picture.permute(0, 3, 1, 2)  # channels last in memory
         stride = self.config.unet.stride
         padded = F.pad(picture, (0, -width % stride, 0, -height % stride))
         return [level.to(picture.dtype) for level in reversed(self.unet.levels(padded))], embedding
@@ -244,7 +245,7 @@ class Denoiser(nn.Module):
         sources = active = None
         if wanted is not None:
             sources = sources_of(wanted, self.config.kernel_sizes).flatten()
-            active = cells_with(wanted, ACTIVE_CELL).repeat_interleave(len(keep), 0)
+            active = cells_with(wanted, TARGET_CELL).repeat_interleave(len(keep), 0)
         for rows, part in self._splat_chunks(samples, embedding, relative, context, scale, keep, sources):
             end = GUIDED_COLUMNS + self.config.embedding
             predictions.append((rows, predict(self.generator, self.layer_bias[keep], part[..., :end], context[rows])))

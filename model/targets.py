@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import torch.nn.functional as F
 from torch import Tensor
 
+TARGET_CELL = 64  # pixels; `affinity_filter` computes or skips targets by cells of this size
+
 
 def cells_with(wanted: Tensor, size: int) -> Tensor:
     """(B, H, W) bool -> (B, ceil(H / size), ceil(W / size)) bool: whether a cell holds any wanted pixel."""
