@@ -22,11 +22,12 @@ from deep_io.flat import write_flat
 from deep_io.header import channels_of
 from deep_io.sequences import Frame
 from pipelines.aovs import mean_depth
-from pipelines.denoise import FramePlan, Job
+from pipelines.denoise import Job
 from pipelines.export import ExportJob
 from pipelines.export_options import FORMS, ExportOptions
 from pipelines.inference import FrameLayers, denoise_bands
 from pipelines.options import DenoiseOptions
+from pipelines.plan import FramePlan
 
 WIDTH, HEIGHT = 1920, 1080
 CPU_TARGET, SIZE_TARGET = 1.5, 2.2

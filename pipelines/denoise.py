@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,68 +23,27 @@ from deep_io.atomic import atomic_output, output_action
 from deep_io.errors import InputError, LbmcError, UsageError
 from deep_io.flat import to_half, write_flat
 from deep_io.header import Header
-from deep_io.path_samples import SampleReader
 from model.denoiser import Denoiser
 from model.features import FrameScale
 from pipelines import __version__
-from pipelines.aovs import Aovs, beauty_channels, find_aovs
+from pipelines.aovs import beauty_channels, find_aovs
+from pipelines.decisions import Decisions, decide, surprises, zero_roles
+from pipelines.frame_reader import FrameReader
 from pipelines.frames import exposure_frame, find_frames
-from pipelines.ids import IdChannel, find_ids, ranked_ids
+from pipelines.ids import find_ids, ranked_ids
 from pipelines.inference import FrameLayers, denoise_bands
 from pipelines.jobs import FrameSkippedError, JobReport, run_frames
 from pipelines.keep import find_kept, kept_channels
 from pipelines.network import choose_device, find_weights, load_network, product_dtype
 from pipelines.options import DenoiseOptions
+from pipelines.plan import FramePlan, Shot, fit
 from pipelines.progress import Progress, make_progress
 from pipelines.survey import Survey, survey
-from pipelines.tiles import DEFAULT_MEMORY, Band, memory_needed, plan_bands
+from pipelines.tiles import DEFAULT_MEMORY
 
 KEEP_BLOCK_BYTES = 64 << 20
-FEW_MIXED = 0.002  # of the pixels; already where depth mixes in 2 %, at the edges alone, one layer costs 6 % relMSE
 SURVEY_SHARE = 0.15  # of a frame's progress
 MODEL_ATTRIBUTE, WEIGHTS_ATTRIBUTE, VERSION_ATTRIBUTE = "lbmc:model", "lbmc:weights", "lbmc:version"
-
-
-@dataclass(frozen=True)
-class Shot:
-    """What is decided once for all frames of a job."""
-
-    scale: FrameScale
-    layers: int
-    weighting: str
-
-
-@dataclass(frozen=True)
-class FramePlan:
-    """What will be done with one frame; `lines` say it for a reader."""
-
-    source: Path
-    survey: Survey
-    shot: Shot
-    roles: tuple[str, ...]
-    bands: list[Band]
-    memory: int
-    mapping: list[str]
-    aovs: Aovs = field(default_factory=Aovs)
-    ids: Sequence[IdChannel] = ()
-    kept: Sequence[str] = ()
-
-    def lines(self) -> list[str]:
-        """The plan, for `--dry-run`."""
-        seen = self.survey
-        return [
-            *self.mapping,
-            f"weighting: {self.shot.weighting}",
-            f"samples: {seen.samples} in {seen.pixels} pixels, {seen.empty_pixels} pixels without any",
-            f"roles in use: {', '.join(self.roles)}",
-            f"exposure: {self.shot.scale.exposure:.6g}, depth scale: {self.shot.scale.depth:.6g}",
-            f"layers: {self.shot.layers}",
-            *([] if seen.mixed is None else [f"depth mixes in {seen.mixed:.1%} of the pixels"]),
-            *(f"AOV: {', '.join(group.outputs)} filtered as {group.kind}" for group in self.aovs.groups),
-            *([f"kept as pixel means: {' '.join(self.kept)}"] if self.kept else []),
-            *(f"ids: {one.channel} ranked as {one.base}" for one in self.ids),
-            f"bands: {len(self.bands)}, about {self.memory / 2**20:.0f} MiB",
-        ]
 
 
 @dataclass(frozen=True)
@@ -115,11 +74,12 @@ class Job:
         self.shot: Shot | None = None
         self.key: Survey | None = None
         self.sources: list[Path] = []
+        self._told: set[str] = set()
 
-    def open(self, source: Path) -> SampleReader:
+    def open(self, source: Path) -> FrameReader:
         """Opens an input with the reading options. Refuses what lbmc wrote unless forced."""
         options = self.options
-        reader = SampleReader(
+        reader = FrameReader(
             source,
             part=options.part,
             overrides=options.overrides,
@@ -134,13 +94,16 @@ class Job:
             raise InputError(f"{source}: written by lbmc, so denoised already; pass --force to denoise it again")
         return reader
 
-    def plan(self, source: Path, reader: SampleReader, update: Callable[[float], None]) -> FramePlan:
+    def plan(self, source: Path, reader: FrameReader, update: Callable[[float], None]) -> FramePlan:
         """Surveys a frame and decides; the first frame decides for the shot."""
         window = reader.header.data_window
         aovs = find_aovs(self.options.aovs, reader.header, reader.mapping, os.fspath(source))
         ids = find_ids(self.options.ids, reader.header, os.fspath(source))
         kept = find_kept(reader.header, reader.weighting, self.options.keep, os.fspath(source))
         reader.carry(aovs.channels("light"), aovs.channels("data"))
+        room = fit(reader, self.net.reach, self.net.stride, self.memory)
+        if room.keep and not self.options.dry_run:
+            reader.keep()
         rows = 0
 
         def counted() -> Any:
@@ -150,7 +113,7 @@ class Job:
                 yield block
                 update(SURVEY_SHARE * rows / window.height)
 
-        seen = survey(counted())
+        seen = survey(counted(), reader.header.display_window)
         if seen.samples == 0:
             raise InputError(f"{source}: no sample has a finite radiance; render the frame again")
         if self.shot is None:
@@ -158,25 +121,23 @@ class Job:
         if reader.weighting != self.shot.weighting:
             raise InputError(f"{source}: weighting {reader.weighting}, but the first frame has {self.shot.weighting}; "
                              f"pass --weighting for the whole sequence")
-        roles = tuple(role for role in self.net.config.roles if role in reader.mapping)
+        held = self.shot.decided.held | (zero_roles(seen) if self.options.adapt else frozenset())
+        present = tuple(role for role in self.net.config.roles if role in reader.mapping)
+        roles = tuple(role for role in present if role not in held)
         if aovs.depth is not None and "depth" not in roles:
             raise UsageError(f"--aov {aovs.depth}: {self.weights.name} was trained without depth; choose another model")
-        per_pixel = seen.samples / max(seen.pixels, 1)
-        bands = plan_bands(window.height, window.width, per_pixel, self.net.reach, self.net.stride, self.memory,
-                           reader.carried)
-        tallest = max(band.read1 - band.read0 for band in bands)
-        needed = memory_needed(tallest, window.width, per_pixel, reader.carried)
-        return FramePlan(source, seen, self.shot, roles, bands, needed, reader.mapping.lines(), aovs, ids, kept)
+        reader.forget(reader.mapping.sources.keys() - {*roles, "coverage"})
+        return FramePlan(source, seen, self.shot, roles, room.bands, room.memory, reader.mapping.lines(), aovs, ids,
+                         kept, held & {*present}, self.options.adapt)
 
     def _decide(self, source: Path, seen: Survey, weighting: str) -> Shot:
         """The shot's scale, both numbers of it, comes from one frame: chunks of a shot that name it agree exactly."""
         options = self.options
         key = self.key or self._first_survey(source, seen)
         scale = FrameScale(options.exposure or key.exposure, key.depth)
-        needed = self.net.config.layers
-        if options.adapt and key.mixed is not None and key.mixed < FEW_MIXED:
-            needed = 1
-        return Shot(scale, options.layers or needed, weighting)
+        decided = decide(key) if options.adapt else Decisions()
+        needed = 1 if decided.one_layer else self.net.config.layers
+        return Shot(scale, options.layers or needed, weighting, decided)
 
     def _first_survey(self, source: Path, seen: Survey) -> Survey:
         """That of the job's first readable frame: a job resumed past frames that exist decides as it did at first."""
@@ -188,7 +149,7 @@ class Job:
     def survey_of(self, source: Path) -> Survey:
         """What another frame of the shot is like. Raises LbmcError."""
         with self.open(source) as reader:
-            return survey(reader.blocks())
+            return survey(reader.blocks(), reader.header.display_window)
 
     def frame(self, frame: sequences.Frame, progress: Progress) -> DenoisedFrame:
         """Denoises one frame. Raises FrameSkippedError, LbmcError."""
@@ -206,6 +167,7 @@ class Job:
                     print(f"  {line}")
                 return DenoisedFrame(None, plan)
             tell_repairs(frame.source, plan.survey.repairs, progress)
+            self._tell_surprises(plan, progress)
             surveyed = time.perf_counter()
             clamped, network = self.produce(frame, targets, plan, reader, lambda done: progress.update(
                 SURVEY_SHARE + (1 - SURVEY_SHARE) * done))
@@ -216,11 +178,20 @@ class Job:
                    "write": time.perf_counter() - surveyed - network}
         return DenoisedFrame(frame.target, plan, clamped, seconds)
 
-    def produce(self, frame: sequences.Frame, wanted: list[Path], plan: FramePlan, reader: SampleReader,
+    def _tell_surprises(self, plan: FramePlan, progress: Progress) -> None:
+        """Once for each thing that a frame has and the shot was decided to do without."""
+        for what, line in surprises(plan.shot.decided, plan.survey).items():
+            if what not in self._told:
+                self._told.add(what)
+                progress.note(f"{plan.source}: {line}; if it matters, pass --exposure-from with a frame that has it, "
+                              f"or --no-adapt")
+
+    def produce(self, frame: sequences.Frame, wanted: list[Path], plan: FramePlan, reader: FrameReader,
                 update: Callable[[float], None]) -> tuple[int, float]:
         """Denoises a frame and writes the files wanted; returns values clamped to half and the network's seconds."""
         begun = time.perf_counter()
-        layers = denoise_bands(reader, self.net, plan.shot.scale, plan.roles, plan.shot.layers, plan.bands, update)
+        layers = denoise_bands(reader, self.net, plan.shot.scale, plan.roles, plan.shot.layers, plan.bands, update,
+                               plan.held, plan.survey.cells if plan.adapt else None)
         network = time.perf_counter() - begun
         return self.write(frame, wanted, plan, layers, reader.header), network
 

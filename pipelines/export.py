@@ -21,15 +21,16 @@ from deep_io.errors import InputError, UsageError
 from deep_io.flat import FlatImage, kept_attributes, write_flat_parts
 from deep_io.header import Header, channels_of
 from deep_io.layer_encoding import OverLayers, deep_samples, encode_layers
-from deep_io.path_samples import SampleReader
 from deep_io.roles import MISS_DEPTH
 from deep_io.sequences import Frame
 from deep_io.weighting import ATTRIBUTE as WEIGHTING_ATTRIBUTE
-from pipelines.denoise import DenoisedFrame, FramePlan, Job, run_job, to_pixel_type
+from pipelines.denoise import DenoisedFrame, Job, run_job, to_pixel_type
 from pipelines.export_options import ExportOptions
 from pipelines.export_samples import SamplesJob
+from pipelines.frame_reader import FrameReader
 from pipelines.inference import FrameLayers
 from pipelines.jobs import JobReport
+from pipelines.plan import FramePlan
 from pipelines.progress import Progress
 
 LAYERS_ATTRIBUTE, FORM_ATTRIBUTE, ORDER_ATTRIBUTE = "lbmc:layers", "lbmc:form", "lbmc:layerOrder"
@@ -47,9 +48,9 @@ class ExportJob(Job):
     def __init__(self, options: ExportOptions) -> None:
         super().__init__(options)
         self.ordered = self.net.config.variant != "layer_w"
-        self._told = False
+        self._told_order = False
 
-    def plan(self, source: Path, reader: SampleReader, update: Callable[[float], None]) -> FramePlan:
+    def plan(self, source: Path, reader: FrameReader, update: Callable[[float], None]) -> FramePlan:
         """As for the beauty. The deep form needs depth: InputError for a file, UsageError for a network without."""
         if self.options.form == "deep" and "depth" not in reader.mapping:
             raise InputError(f"{source}: has no depth, which deep layers need; name the layer that holds it with "
@@ -62,9 +63,9 @@ class ExportJob(Job):
 
     def frame(self, frame: Frame, progress: Progress) -> DenoisedFrame:
         """Denoises and writes one frame; says once if the layers have no order."""
-        if not self.ordered and not self._told:
+        if not self.ordered and not self._told_order:
             progress.note(UNORDERED)
-            self._told = True
+            self._told_order = True
         return super().frame(frame, progress)
 
     def targets(self, frame: Frame) -> list[Path]:

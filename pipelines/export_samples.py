@@ -20,12 +20,14 @@ from deep_io.deep_reader import DeepReader
 from deep_io.deep_writer import DeepWriter
 from deep_io.errors import InputError
 from deep_io.header import Channel, Header
-from deep_io.path_samples import PathSamples, SampleReader
+from deep_io.path_samples import PathSamples
 from deep_io.samples import DeepSamples
 from deep_io.sequences import Frame
-from pipelines.denoise import VERSION_ATTRIBUTE, FramePlan, Job
+from pipelines.denoise import VERSION_ATTRIBUTE, Job
 from pipelines.export_options import ExportOptions
+from pipelines.frame_reader import FrameReader
 from pipelines.inference import to_model
+from pipelines.plan import FramePlan
 
 PARTITION_ATTRIBUTE = "lbmc:partition"  # not lbmc:model, which says that a file is denoised
 
@@ -36,7 +38,7 @@ class SamplesJob(Job):
     options: ExportOptions
 
     @torch.inference_mode()
-    def produce(self, frame: Frame, wanted: list[Path], plan: FramePlan, reader: SampleReader,
+    def produce(self, frame: Frame, wanted: list[Path], plan: FramePlan, reader: FrameReader,
                 update: Callable[[float], None]) -> tuple[int, float]:
         """Band by band, so that a frame larger than memory passes too. Nothing is clamped, nothing timed apart."""
         options, layers = self.options, plan.shot.layers
@@ -50,7 +52,7 @@ class SamplesJob(Job):
             top = raw.header.data_window.ymin
             for number, band in enumerate(plan.bands):
                 block = reader.read(top + band.read0, top + band.read1)
-                samples = to_model(block, plan.roles, plan.shot.scale.depth, self.device)
+                samples = to_model(block, plan.roles, plan.shot.scale.depth, self.device, held=plan.held)
                 shares = self.net.partition(samples, plan.shot.scale, layers).float().cpu().numpy()
                 shares = np.pad(shares, ((0, 0), (count - layers, 0)))
                 stored = stored_shares(block, shares, int(row_samples[band.read0 : band.read1].sum()))

@@ -17,7 +17,8 @@ from model.compositing import Layers, fill_holes
 from model.denoiser import Denoiser
 from model.features import FrameScale
 from model.samples import Samples
-from pipelines.tiles import Band
+from pipelines.cells import Cells, merged
+from pipelines.tiles import Band, narrowed
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -58,17 +59,17 @@ class FrameLayers:
                            pad(self.extra))
 
 
-def to_model(block: PathSamples, roles: tuple[str, ...], depth: float, device: torch.device, lights: int = 0
-             ) -> Samples:
+def to_model(block: PathSamples, roles: tuple[str, ...], depth: float, device: torch.device, lights: int = 0,
+             held: frozenset[str] = frozenset(), squares: FloatArray | None = None) -> Samples:
     """A block of decoded samples as the model's input, with those of the roles that the block has.
 
-    The first `lights` of the block's extra columns are parts of the radiance.
+    The first `lights` of the block's extra columns are parts of the radiance. `held` and `squares` as in `Samples`.
     A depth of 0 is an unknown one and becomes `depth`, the frame's scale, which tells the network nothing.
     """
     height, width = block.counts.shape
-    if "depth" in block.roles:
-        unknown = block.roles["depth"] <= 0
-        block.roles["depth"] = np.where(unknown, np.float32(depth), block.roles["depth"])
+    values = {role: values for role, values in block.roles.items() if role in roles}
+    if "depth" in values:
+        values["depth"] = np.where(values["depth"] <= 0, np.float32(depth), values["depth"])
 
     def tensor(array: npt.NDArray[np.generic]) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(device)
@@ -78,9 +79,11 @@ def to_model(block: PathSamples, roles: tuple[str, ...], depth: float, device: t
         counts=tensor(block.counts.reshape(-1)),
         weight=tensor(block.weight),
         coverage=tensor(block.coverage),
-        roles={role: tensor(values) for role, values in block.roles.items() if role in roles},
+        roles={role: tensor(array) for role, array in values.items()},
         extra=tensor(block.extra) if block.extra.shape[1] else None,
         lights=lights,
+        squares=None if squares is None else tensor(squares),
+        held=held,
     )
 
 
@@ -93,8 +96,14 @@ def denoise_bands(
     layers: int,
     bands: list[Band],
     update: Callable[[float], None] = lambda _: None,
+    held: frozenset[str] = frozenset(),
+    cells: Cells | None = None,
 ) -> FrameLayers:
-    """Denoises a frame band by band; the bands' halos make the result independent of the cuts."""
+    """Denoises a frame band by band; the bands' halos make the result independent of the cuts.
+
+    cells : those that pass through are not filtered, and what is out of reach of all others is not even read. None:
+        everything is filtered
+    """
     window = reader.header.data_window
     device = next(net.parameters()).device
     size = (window.height, window.width)
@@ -105,16 +114,37 @@ def denoise_bands(
         depth=torch.empty(1, layers, *size),
         extra=torch.empty(1, layers, reader.carried, *size),
     )
+    passing = np.zeros(size, np.bool_) if cells is None else cells.mask
+    busy: npt.NDArray[np.bool_] = np.logical_not(passing.all(1))
+    bands = narrowed(bands, busy, window.height, net.reach, net.stride)
     for number, band in enumerate(bands):
-        block = reader.read(window.ymin + band.read0, window.ymin + band.read1)
-        samples = to_model(block, roles, scale.depth, device, reader.carried_lights)
+        block, squares = reader.read(window.ymin + band.read0, window.ymin + band.read1), None
+        if cells is not None:
+            block, squares = merged(block, cells.alike[band.read0 : band.read1])
+        samples = to_model(block, roles, scale.depth, device, reader.carried_lights, held, squares)
         del block
-        result = net(samples, scale, layers, fill=False)
+        wanted = torch.zeros(1, band.read1 - band.read0, window.width, dtype=torch.bool)
         rows = slice(band.y0 - band.read0, band.y1 - band.read0)
+        wanted[0, rows] = torch.from_numpy(~passing[band.y0 : band.y1])
+        result = net(samples, scale, layers, fill=False, wanted=wanted.to(device))
         for whole, part in zip(_planes(frame), _planes(result), strict=True):
             whole[..., band.y0 : band.y1, :] = part[..., rows, :].cpu()
         update((number + 1) / len(bands))
+    if cells is not None and cells.means is not None:
+        _pass_through(frame, cells, cells.means, passing)
     return FrameLayers(*(plane[0].numpy() for plane in _planes(fill_holes(frame))))
+
+
+def _pass_through(frame: Layers, cells: Cells, means: FloatArray, passing: npt.NDArray[np.bool_]) -> None:
+    """Writes the pixels' means into the passing cells, as the background layer; unknown pixels are holes."""
+    where = torch.from_numpy(passing)
+    known = torch.from_numpy((passing & cells.known)[passing]).float()
+    color, extra = torch.from_numpy(means[passing].T).split([3, means.shape[2] - 3])
+    for plane, empty in zip(_planes(frame), (0.0, 0.0, 0.0, torch.inf, 0.0), strict=True):
+        plane[..., where] = empty
+    frame.color[0, -1][:, where] = color
+    frame.extra[0, -1][:, where] = extra
+    frame.weight[0, -1][where] = known
 
 
 def _planes(layers: Layers) -> tuple[torch.Tensor, ...]:

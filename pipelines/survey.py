@@ -1,6 +1,7 @@
-"""What a frame is like, measured before it is denoised: exposure, depth scale, mixing of depths, sample counts.
+"""What a frame is like, measured before it is denoised: exposure, depth scale, mixing of depths, what says nothing.
 
-One pass over the file in blocks of rows, so a frame larger than memory is surveyed too.
+One pass over the file in blocks of rows, so a frame larger than memory is surveyed too. What follows from it is
+decisions.py's.
 """
 
 from __future__ import annotations
@@ -13,8 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from deep_io.path_samples import PathSamples
+from deep_io.samples import Window
+from pipelines.cells import Cells, CellSurvey
 
 EXPOSURE_BIN = 16  # pixels along a bin's side
+STIRRING = 1 / 16  # beyond it a role says something; in pixels, motion and blur below it are less than a filter's width
 MIXED_DEPTH = 0.1  # of the depth: hits of a pixel that are closer together are one surface
 
 
@@ -27,6 +31,10 @@ class Survey:
     pixels, empty_pixels, samples : counts
     mixed : share of the pixels in which depth mixes: hits further apart than MIXED_DEPTH, or hits and misses; None
         without depth
+    hits : samples that hit anything
+    largest : the largest magnitude of each role but radiance and depth, over all hits; of a role that varies beyond
+        STIRRING anywhere, only that it does: infinity
+    cells : the cells with nothing to do
     repairs : non-finite values that were mended, by role
     """
 
@@ -36,38 +44,69 @@ class Survey:
     empty_pixels: int
     samples: int
     mixed: float | None
+    hits: int
+    largest: dict[str, float]
+    cells: Cells
     repairs: dict[str, int]
 
 
-def survey(blocks: Iterable[PathSamples]) -> Survey:
-    """Looks at every sample of a frame, given as blocks of whole rows from the top."""
-    bins: dict[int, npt.NDArray[np.float64]] = {}
-    areas: dict[int, npt.NDArray[np.float64]] = {}
-    depths: list[npt.NDArray[np.float64]] = []
-    repairs: Counter[str] = Counter()
-    pixels = empty = samples = mixed = 0
-    top: int | None = None
+def survey(blocks: Iterable[PathSamples], display: Window | None = None) -> Survey:
+    """Looks at every sample of a frame, given as blocks of whole rows from the top.
+
+    display : the display window, where the grid of cells begins; None: the first block's corner
+    """
+    gathered: Surveyor | None = None
     for block in blocks:
-        top = block.window.ymin if top is None else top
-        luminance = _pixel_luminance(block)
-        _add_bins(bins, areas, luminance, block.window.ymin - top)
+        gathered = gathered or Surveyor(display or block.window)
+        gathered.add(block)
+    assert gathered is not None
+    return gathered.result()
+
+
+class Surveyor:
+    """A survey in the making, for a caller that looks at the blocks itself."""
+
+    def __init__(self, display: Window) -> None:
+        self._bins: dict[int, npt.NDArray[np.float64]] = {}
+        self._areas: dict[int, npt.NDArray[np.float64]] = {}
+        self._depths: list[npt.NDArray[np.float64]] = []
+        self._repairs: Counter[str] = Counter()
+        self._pixels = self._empty = self._samples = self._mixed = self._hits = 0
+        self._largest: dict[str, float] = {}
+        self._cells = CellSurvey((display.xmin, display.ymin))
+        self._top: int | None = None
+
+    def add(self, block: PathSamples) -> None:
+        """Takes in the next rows."""
+        self._top = block.window.ymin if self._top is None else self._top
+        _add_bins(self._bins, self._areas, _pixel_luminance(block), block.window.ymin - self._top)
         if "depth" in block.roles:
-            depths.append(pixel_depth(block))
-            mixed += int(_mixes_depth(block).sum())
-        repairs.update(block.repairs)
-        pixels += block.counts.size
-        empty += int((block.counts == 0).sum())
-        samples += len(block.weight)
-    means = np.concatenate([bins[row] / areas[row] for row in sorted(bins)])
-    return Survey(
-        exposure=exposure_of_bins(means),
-        depth=median_depth(depths),
-        pixels=pixels,
-        empty_pixels=empty,
-        samples=samples,
-        mixed=mixed / max(pixels, 1) if depths else None,
-        repairs=dict(repairs),
-    )
+            self._depths.append(pixel_depth(block))
+            self._mixed += int(_mixes_depth(block).sum())
+        for role in block.roles.keys() - {"radiance", "depth"}:
+            self._largest[role] = _largest(block.roles[role], self._largest.get(role, 0.0))
+        self._cells.add(block)
+        self._repairs.update(block.repairs)
+        self._pixels += block.counts.size
+        self._empty += int((block.counts == 0).sum())
+        self._samples += len(block.weight)
+        self._hits += int((block.coverage > 0).sum())
+
+    def result(self) -> Survey:
+        """What was found, after the last row."""
+        means = np.concatenate([self._bins[row] / self._areas[row] for row in sorted(self._bins)])
+        return Survey(
+            exposure=exposure_of_bins(means),
+            depth=median_depth(self._depths),
+            pixels=self._pixels,
+            empty_pixels=self._empty,
+            samples=self._samples,
+            mixed=self._mixed / max(self._pixels, 1) if self._depths else None,
+            hits=self._hits,
+            largest=self._largest,
+            cells=self._cells.result(),
+            repairs=dict(self._repairs),
+        )
 
 
 def exposure_of(radiance: npt.NDArray[np.float32]) -> float:
@@ -86,6 +125,14 @@ def exposure_of_bins(means: npt.NDArray[np.float64]) -> float:
     """Exposure from the bins' mean radiance."""
     positive = means[means > 0]
     return float(2.0 ** -np.median(np.log2(positive))) if positive.size else 1.0
+
+
+def _largest(values: npt.NDArray[np.float32], before: float) -> float:
+    """The largest magnitude so far; one beyond STIRRING settles it, and nothing is looked at any more."""
+    if before > STIRRING or not values.size:
+        return before
+    size = max(before, float(values.max()), -float(values.min()))
+    return size if size <= STIRRING else np.inf
 
 
 def _pixel_luminance(block: PathSamples) -> npt.NDArray[np.float64]:

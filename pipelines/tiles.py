@@ -8,6 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+import numpy.typing as npt
+
 BYTES_PER_SAMPLE = 160  # decoded roles in float32, and what the network holds per sample
 BYTES_PER_PIXEL = 3600  # planes, predictions and context of two layers at their peak
 CARRIED_PER_SAMPLE, CARRIED_PER_PIXEL = 16, 128  # more of both for each channel filtered besides the radiance
@@ -43,6 +46,20 @@ def plan_bands(height: int, width: int, samples_per_pixel: float, reach: int, st
     rows = -(-height // -(-height // fitting))  # as many bands, but equal ones
     rows = -(-rows // stride) * stride
     return [_band(y, min(y + rows, height), height, reach, stride) for y in range(0, height, rows)]
+
+
+def narrowed(bands: list[Band], busy: npt.NDArray[np.bool_], height: int, reach: int, stride: int) -> list[Band]:
+    """The bands without rows of the frame that nothing is wanted of: busy (H,) says of which something is.
+
+    What goes is whole bands, and rows above the first and below the last busy row of a band.
+    """
+    some = []
+    for band in bands:
+        rows = np.flatnonzero(busy[band.y0 : band.y1])
+        if rows.size:
+            first = band.y0 + int(rows[0]) // stride * stride
+            some.append(_band(first, band.y0 + int(rows[-1]) + 1, height, reach, stride))
+    return some
 
 
 def _band(y0: int, y1: int, height: int, reach: int, stride: int) -> Band:

@@ -1,0 +1,97 @@
+"""What will be done with a frame, decided before the network runs: said by `--dry-run`, followed by the job."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from model.features import FrameScale
+from pipelines.aovs import Aovs
+from pipelines.decisions import Decisions
+from pipelines.frame_reader import FrameReader
+from pipelines.ids import IdChannel
+from pipelines.survey import Survey
+from pipelines.tiles import Band, memory_needed, plan_bands
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What is decided once for all frames of a job.
+
+    decided : what its first frame, or the one that stands for it, does without
+    """
+
+    scale: FrameScale
+    layers: int
+    weighting: str
+    decided: Decisions = field(default_factory=Decisions)
+
+
+@dataclass(frozen=True)
+class FramePlan:
+    """What will be done with one frame; `lines` say it for a reader.
+
+    roles : those whose values the network reads
+    held : those it is told to say nothing
+    adapt : whether the cells that the survey found to have nothing to do pass through
+    """
+
+    source: Path
+    survey: Survey
+    shot: Shot
+    roles: tuple[str, ...]
+    bands: list[Band]
+    memory: int
+    mapping: list[str]
+    aovs: Aovs = field(default_factory=Aovs)
+    ids: Sequence[IdChannel] = ()
+    kept: Sequence[str] = ()
+    held: frozenset[str] = frozenset()
+    adapt: bool = False
+
+    def lines(self) -> list[str]:
+        """The plan, for `--dry-run`."""
+        seen = self.survey
+        return [
+            *self.mapping,
+            f"weighting: {self.shot.weighting}",
+            f"samples: {seen.samples} in {seen.pixels} pixels, {seen.empty_pixels} pixels without any",
+            f"roles in use: {', '.join(self.roles)}",
+            *([f"roles held, which say nothing here: {', '.join(sorted(self.held))}"] if self.held else []),
+            f"exposure: {self.shot.scale.exposure:.6g}, depth scale: {self.shot.scale.depth:.6g}",
+            f"layers: {self.shot.layers}",
+            *([] if seen.mixed is None else [f"depth mixes in {seen.mixed:.1%} of the pixels"]),
+            *(seen.cells.lines() if self.adapt else []),
+            *(f"AOV: {', '.join(group.outputs)} filtered as {group.kind}" for group in self.aovs.groups),
+            *([f"kept as pixel means: {' '.join(self.kept)}"] if self.kept else []),
+            *(f"ids: {one.channel} ranked as {one.base}" for one in self.ids),
+            f"bands: {len(self.bands)}, about {self.memory / 2**20:.0f} MiB",
+        ]
+
+
+@dataclass(frozen=True)
+class Room:
+    """How a frame is fitted into a memory budget."""
+
+    bands: list[Band]
+    memory: int
+    keep: bool
+    """Whether the decoded frame stays in memory between survey and network: only where that costs no band."""
+
+
+def fit(reader: FrameReader, reach: int, stride: int, memory: int) -> Room:
+    """Plans the bands of a frame from its header and the sizes of its rows; no sample is read."""
+    window = reader.header.data_window
+    per_pixel = reader.total / (window.width * window.height)
+
+    def planned(budget: int) -> list[Band]:
+        return plan_bands(window.height, window.width, per_pixel, reach, stride, budget, reader.carried)
+
+    bands, beside = planned(memory), 0
+    keep = len(bands) == 1  # the network's estimate holds a decoded frame already
+    if not keep and memory > reader.kept_bytes and len(planned(memory - reader.kept_bytes)) == len(bands):
+        bands, beside, keep = planned(memory - reader.kept_bytes), reader.kept_bytes, True
+    tallest = max(band.read1 - band.read0 for band in bands)
+    needed = memory_needed(tallest, window.width, per_pixel, reader.carried)
+    return Room(bands, needed + beside, keep)
