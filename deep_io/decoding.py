@@ -20,7 +20,7 @@ from deep_io.errors import InputError, UsageError
 from deep_io.header import Header
 from deep_io.over import decode_over
 from deep_io.role_matching import map_roles
-from deep_io.roles import ROLES, RoleMap
+from deep_io.roles import MISS_DEPTH, ROLES, RoleMap
 from deep_io.samples import DeepSamples, Window
 from deep_io.weighting import (
     ATTRIBUTE,
@@ -35,6 +35,10 @@ from deep_io.weighting import (
 Values = NDArray[np.float32]
 
 _LARGEST_HALF = np.float32(65504)
+# Beyond these a value is as broken as Inf: FLT_MAX is what uninitialised or overflowed buffers hold, and the network's
+# sums and products of such values would overflow. A feature beyond half's range is none either.
+LARGEST_RADIANCE = np.float32(1e30)
+LARGEST_FEATURE = _LARGEST_HALF
 
 
 @dataclass
@@ -48,7 +52,8 @@ class PathSamples:
                                     0 in every role but radiance where coverage is 0, and for values that were mended,
                                     so a depth of 0 is an unknown one
     window    Window                the pixels' place in the frame
-    repairs   Counter               role -> samples whose value was not finite (or a depth negative) and mended
+    repairs   Counter               role -> samples whose value was broken (not finite, absurdly large, a negative
+                                    depth) and mended
     extra     float32 (N, E)        the channels carried along, those that are parts of the radiance first
     source    int64 (N,)            which sample of the file's block each one is, -1 for a virtual miss; None: all, in
                                     their order
@@ -154,14 +159,14 @@ def decode_block(counts: NDArray[np.int32], channels: dict[str, NDArray[np.gener
 
 
 def _carried(names: tuple[str, ...], channels: Mapping[str, NDArray[np.generic]], repairs: Counter[str]) -> Values:
-    """(N, len(names)) float32 of channels, finite: an overflow of half is its largest value, the rest becomes 0."""
+    """(N, len(names)) float32 of channels, sound: an overflow of half is its largest value, the rest becomes 0."""
     columns = []
     for name in names:
         values = channels[name].astype(np.float32)
-        if not _all_finite(values):
-            repairs[name] += int((~np.isfinite(values)).sum())
+        if not _all_within(values, LARGEST_RADIANCE):
+            repairs[name] += int((~_within(values, LARGEST_RADIANCE)).sum())
             values[np.isposinf(values) & (channels[name].dtype == np.float16)] = _LARGEST_HALF
-            values[~np.isfinite(values)] = 0
+            values[~_within(values, LARGEST_RADIANCE)] = 0
         columns.append(values)
     return np.stack(columns, axis=1) if columns else np.empty((0, 0), np.float32)
 
@@ -208,23 +213,27 @@ def _in_order(stored: Values, decoded: Weighted) -> Values:
     return stored[decoded.order]  # a virtual miss reads the last sample, and is zeroed with the other misses
 
 
-def _all_finite(values: Values) -> bool:
-    """Whether everything is finite; a sum overflows at worst, and then the slow way decides."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return bool(np.isfinite(values.sum())) or bool(np.isfinite(values).all())
+def _within(values: Values, largest: np.float32) -> NDArray[np.bool_]:
+    """Which values are numbers of a magnitude up to `largest`; NaN is not."""
+    return np.abs(values) <= largest
+
+
+def _all_within(values: Values, largest: np.float32) -> bool:
+    """Whether all are; NaN goes through minimum and maximum and compares as false."""
+    return not values.size or bool(values.max() <= largest and values.min() >= -largest)
 
 
 def _radiance(mapping: RoleMap, channels: dict[str, NDArray[np.generic]], weighting: str, repairs: Counter[str]
               ) -> tuple[Values, NDArray[np.bool_] | None]:
-    """Radiance (N, 3), finite, and which samples have none and must be left out (None: no sample)."""
+    """Radiance (N, 3), sound, and which samples have none and must be left out (None: no sample)."""
     half = np.array([channels[name].dtype == np.float16 for name in mapping["radiance"].channels])
     radiance = _stack(mapping, "radiance", channels)
-    if _all_finite(radiance):
+    if _all_within(radiance, LARGEST_RADIANCE):
         return radiance, None
-    repairs["radiance"] += int((~np.isfinite(radiance)).any(axis=1).sum())
+    repairs["radiance"] += int((~_within(radiance, LARGEST_RADIANCE)).any(axis=1).sum())
     # Half's largest value is what a renderer's overflow stands for; in float, Inf is as wrong as NaN.
     radiance[np.isposinf(radiance) & half] = _LARGEST_HALF
-    broken: NDArray[np.bool_] = np.logical_not(np.isfinite(radiance).all(axis=1))
+    broken: NDArray[np.bool_] = np.logical_not(_within(radiance, LARGEST_RADIANCE).all(axis=1))
     radiance[broken] = 0
     return (radiance, broken) if weighting != "over" and bool(broken.any()) else (radiance, None)
 
@@ -268,13 +277,14 @@ def _cover_by_depth(decoded: Weighted, depth: Values | None, conventions: Conven
 
 
 def _mend(values: Values, role: str, misses: Index, repairs: Counter[str]) -> None:
-    """Set the missing value on misses, which does not count, and on values not finite (or depth < 0), which does."""
+    """Set the missing value on misses, which does not count, and on broken values (or a depth below 0), which does."""
     missing = np.float32(ROLES[role].missing)
     values[misses] = missing
+    largest = np.float32(MISS_DEPTH) if role == "depth" else LARGEST_FEATURE
     negative = role == "depth" and bool(values.size) and not values.min() >= 0
-    if not negative and _all_finite(values):
+    if not negative and _all_within(values, largest):
         return
-    bad = ~np.isfinite(values).all(axis=1)
+    bad = ~_within(values, largest).all(axis=1)
     if role == "depth":
         bad |= values[:, 0] < 0
     repairs[role] += int(bad.sum())

@@ -110,6 +110,17 @@ def test_features_that_are_not_finite_become_missing_and_are_counted_but_not_on_
     assert samples.counts.tolist() == [[3]]
 
 
+def test_numbers_as_large_as_buffers_that_overflowed_are_broken_like_infinity(file):
+    largest = float(np.finfo(np.float32).max)
+    path = write(file, {**rgb(1, largest, 1e29, -1), "albedo.R": [largest, 0, 0, 65504], "albedo.G": [0] * 4,
+                        "albedo.B": [0] * 4, "roughness": [0.5, 0.5, -largest, 0.5]}, dtype=np.float32)
+    samples = read(path)
+    assert samples.roles["radiance"][:, 0].tolist() == [1, np.float32(1e29), -1]
+    assert samples.roles["albedo"].tolist() == [[0, 0, 0], [0, 0, 0], [65504, 0, 0]]
+    assert samples.roles["roughness"][:, 0].tolist() == [0.5, 0, 0.5]
+    assert samples.repairs == {"radiance": 1, "albedo": 1, "roughness": 1}
+
+
 def test_alpha_that_is_not_finite_is_no_coverage(file):
     samples = read(write(file, {**rgb(1, 1), "A": [NAN, 1]}))
     assert samples.coverage.tolist() == [0, 1]
