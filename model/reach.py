@@ -7,6 +7,7 @@ make the answer depend on x modulo the stride, so all x of one stride are asked.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 from model.config import DIVISOR_WINDOW, Config, UNetConfig
 
@@ -84,6 +85,7 @@ def _output_span(x: int, config: Config, halo: int) -> Span:
     return _grow(_union(*seen), halo)
 
 
+@lru_cache(maxsize=8)
 def influence(config: Config, stride: int, halo: int) -> int:
     """Pixels: nothing farther than this from a pixel changes it, if tiles start at multiples of `stride`."""
     spans = ((x, _output_span(x, config, halo)) for x in range(stride))

@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from deep_io.path_samples import PathSamples
-from deep_io.samples import Window
 
 CELL = 64  # pixels along a cell's side
 ALIKE = 1 / 64  # of the largest radiance of a pixel: its samples differ less, so their mean is off by 0.5 % at most
@@ -132,15 +131,11 @@ def merged(block: PathSamples, alike: Mask) -> tuple[PathSamples, Floats]:
         shares = block.weight[inside][:, None] * block.extra[inside]
         extra[first] = np.add.reduceat(shares, starts, 0) / np.where(totals > 0, totals, 1)[:, None]
     counts = np.where(alike, np.int32(1), block.counts)
-    roles = {role: values[kept] for role, values in block.roles.items()}
-    extra = extra[kept] if extra.shape[1] else extra
-    less = PathSamples(counts, weight[kept], block.coverage[kept], roles, block.window, block.repairs, extra)
-    return less, squares[kept]
-
-
-def grid_origin(display: Window) -> tuple[int, int]:
-    """Where the grid of cells begins: the display window's first pixel."""
-    return display.xmin, display.ymin
+    index = np.flatnonzero(kept)  # several times faster than the mask, for rows
+    roles = {role: values.take(index, 0) for role, values in block.roles.items()}
+    extra = extra.take(index, 0) if extra.shape[1] else extra
+    less = PathSamples(counts, weight[index], block.coverage[index], roles, block.window, block.repairs, extra)
+    return less, squares[index]
 
 
 def _missed(block: PathSamples) -> Mask:
@@ -156,9 +151,9 @@ def _missed(block: PathSamples) -> Mask:
 def _backgrounds(block: PathSamples, missed: Mask) -> tuple[Mask, Mask, Floats]:
     """(M,) whether the samples of each missed pixel are nearly, and exactly alike, and their means (M, 3 + E)."""
     counts = block.counts.reshape(-1)
-    inside = np.repeat(missed, counts)
+    inside = np.flatnonzero(np.repeat(missed, counts))
     starts = np.cumsum(counts[missed]) - counts[missed]
-    radiance = block.roles["radiance"][inside]
+    radiance = block.roles["radiance"].take(inside, 0)
     low, high = np.minimum.reduceat(radiance, starts, 0), np.maximum.reduceat(radiance, starts, 0)
     spread, size = (high - low).max(1), np.maximum(np.abs(high), np.abs(low)).max(1)
     columns = [radiance, block.extra[inside]] if block.extra.shape[1] else [radiance]
