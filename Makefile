@@ -55,7 +55,7 @@ lint: $(VENV)/tested
 # The tests run beside a copy of themselves, not beside the sources: what they import is the installed wheel.
 test: lint
 	rm -rf $(TESTBED) && mkdir -p $(TESTBED)
-	for item in tests examples benchmarks docs README.md pyproject.toml constraints.txt; do
+	for item in tests examples benchmarks docs README.md results.json pyproject.toml constraints.txt; do
 	  if [ -e "$$item" ]; then cp -r "$$item" $(TESTBED)/; fi
 	done
 	cd $(TESTBED) && env -u PYTHONPATH $(BIN)/python -P -m pytest

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The tables of the documentation that state what the code states: printed from the code, checked by a test.
+"""The tables of the documentation: printed from the code and from measured results, checked by a test.
 
     python docs/tables.py            says which tables differ; exit code 1 if any does
     python docs/tables.py --write    brings them up to date
@@ -14,6 +14,8 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+
+from result_tables import RESULT_TABLES
 
 from deep_io.aliases import ALIASES, CAMERA_Z_FORWARD, DISTANCE, NOT_A_ROLE, RENDERER_MARKS, VIEW, WORLD, Alias
 from deep_io.roles import ROLES
@@ -97,6 +99,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "renderers": renderers,
     "no-roles": no_roles,
     "networks": networks,
+    **RESULT_TABLES,
 }
 
 

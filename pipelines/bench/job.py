@@ -39,6 +39,9 @@ Item = TypeVar("Item")
 RESULTS, TABLE, REPORT = "results.json", "results.md", "report.html"
 GROWN = ("LAYER", "SAMPLESPLAT")
 """Of the paper's networks, those whose time is measured from 4 to 64 samples."""
+UNTRAINED_FRAME = 256
+"""Pixels along a side of the frame that untrained networks are timed on, at most: a network of a published width takes
+a minute of the frame that the others have."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,7 @@ class Bench:
         protocol = {
             "repeats": options.repeats, "warm_up": 1, "interleaved": True, "statistic": "median",
             "oidn": oidn_installed(), "growth_pixels": SIDE * SIDE,
-            "frame": options.frame,
+            "frame": options.frame, "untrained_frame": min(options.frame, UNTRAINED_FRAME),
         }
         self.results = Results(machine(options.threads), protocol, self.specs, infos)
         # One scene stands for all where each run is dear: the first of the largest group.
@@ -147,6 +150,9 @@ class Bench:
         options = self.options
         curves = [(scene, most) for scene in self.scenes for most in scene.thinned_counts()] if options.curves else []
         frames = self._frames()
+        self.untrained = frames[self.example.name]
+        if options.frame > UNTRAINED_FRAME and options.paper:
+            self.untrained = self._enlarged(self.example, UNTRAINED_FRAME)
         steps = len(self.scenes) + len(frames) * (1 + options.repeats) + len(curves) + len(options.growth)
         with_memory = options.memory and measurable()
         steps += len(self.specs) if with_memory else 0
@@ -161,7 +167,8 @@ class Bench:
             if with_memory:
                 for spec in _steps(self.specs, progress, "memory of"):
                     self.results.memory[spec.name] = peak_memory(
-                        spec, frames[self.example.name].source, options.threads, self.folder)
+                        spec, frames[self.example.name].source if spec.scored else self.untrained.source,
+                        options.threads, self.folder)
         return self.results, self.gallery
 
     def _run(self, spec: MethodSpec, source: Path) -> Times:
@@ -189,9 +196,12 @@ class Bench:
         frames = {}
         for samples in self.results.groups():
             scene = next(scene for scene in self.scenes if scene.samples == samples)
-            source = self.folder / f"{scene.name}.frame.exr"
-            frames[scene.name] = TimedFrame(scene.name, source, write_enlarged(scene, self.options.frame, source))
+            frames[scene.name] = self._enlarged(scene, self.options.frame)
         return frames
+
+    def _enlarged(self, scene: Scene, side: int) -> TimedFrame:
+        source = self.folder / f"{scene.name}.{side}.exr"
+        return TimedFrame(scene.name, source, write_enlarged(scene, side, source))
 
     def _time(self, frames: dict[str, TimedFrame], scores: dict[str, dict[str, dict[str, float | None]]],
               progress: Progress) -> None:
@@ -200,16 +210,18 @@ class Bench:
             for frame in _steps(frames.values(), progress, "times of"):
                 for spec in self.specs:
                     if spec.scored or frame.name == self.example.name:
-                        runs.setdefault((frame.name, spec.name), []).append(self._run(spec, frame.source))
+                        source = frame.source if spec.scored else self.untrained.source
+                        runs.setdefault((frame.name, spec.name), []).append(self._run(spec, source))
         for scene in self.scenes:
             for spec in self.specs:
                 times = runs.get((scene.name, spec.name), [])[1:]
                 found = scores[scene.name].get(spec.name)
                 if times or found:
+                    timed = frames[scene.name] if spec.scored and times else self.untrained
                     self.results.measurements.append(Measurement(
                         scene.name, spec.name, found,
                         _median([run.cpu for run in times]), _median([run.wall for run in times]),
-                        frames[scene.name].megapixels if times else 0.0,
+                        timed.megapixels if times else 0.0,
                     ))
 
     def _curve(self, scene: Scene, most: int) -> None:

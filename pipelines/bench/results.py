@@ -90,6 +90,18 @@ class Results:
         """For JSON."""
         return {"format": FORMAT, **dataclasses.asdict(self)}
 
+    @staticmethod
+    def from_dict(data: Mapping[str, Any]) -> Results:
+        """The inverse of `to_dict`, also after a trip through JSON. Raises ValueError for another format."""
+        if data.get("format") != FORMAT:
+            raise ValueError(f"bench results of format {data.get('format')}, not {FORMAT}; run lbmc bench again")
+        return Results(
+            data["machine"], data["protocol"], [MethodSpec(**row) for row in data["methods"]],
+            [SceneInfo(**row) for row in data["scenes"]], [Measurement(**row) for row in data["measurements"]],
+            [CurvePoint(**row) for row in data["curve"]], [GrowthPoint(**row) for row in data["growth"]],
+            dict(data["memory"]),
+        )
+
     def groups(self) -> list[int]:
         """Samples per pixel of the scenes; the largest group of scenes first."""
         counts = [scene.samples for scene in self.scenes]

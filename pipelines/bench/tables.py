@@ -155,8 +155,10 @@ def protocol_lines(results: Results) -> list[str]:
         "Errors are those of the files written (half), on linear RGB at the common scale.",
     ]
     if results.memory or any(spec.family == "paper" for spec in results.methods):
-        lines.append(f"Untrained networks and memory are measured on {protocol['example']} alone; memory is what a "
-                     "fresh process takes at its peak beyond its libraries.")
+        size = protocol.get("untrained_frame")
+        lines.append(f"Untrained networks and memory are measured on {protocol['example']} alone"
+                     + (f", untrained networks on {size} x {size} pixels of it" if size else "")
+                     + "; memory is what a fresh process takes at its peak beyond its libraries.")
     if max(row.megapixels for row in results.measurements) < SMALL_FRAME:
         lines.append("The frames are small, so that what a run costs at any size (opening files, starting a filter) "
                      "weighs more than in a film frame; compare methods, do not predict frames.")

@@ -14,6 +14,7 @@ import pytest
 from deep_io import Window
 from model.metrics import score
 from pipelines.bench.methods import SAVINGS, oidn_installed
+from pipelines.bench.results import Results
 from pipelines.compare import read_rgb
 from tests.end_to_end.bench_scenes import write_pair, write_reference
 from tests.end_to_end.scenes import random_weights
@@ -143,9 +144,18 @@ def test_the_page_asks_for_nothing_from_outside(report: Path) -> None:
     assert "Pareto front" in page
 
 
-def test_an_unscored_network_has_a_time_and_no_error(folder: Path, tmp_path: Path, weights: Path) -> None:
-    """The paper's networks, on one scene of 32 x 24 pixels."""
-    words = [word for word in QUICK if word != "--no-paper"]
+def test_results_survive_json(results: dict[str, Any]) -> None:
+    assert json.loads(json.dumps(Results.from_dict(results).to_dict())) == results
+    with pytest.raises(ValueError, match="format 0"):
+        Results.from_dict({**results, "format": 0})
+
+
+def test_an_unscored_network_has_a_time_and_no_error(
+    folder: Path, tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The paper's networks, on a frame of their own, which is smaller."""
+    monkeypatch.setattr("pipelines.bench.job.UNTRAINED_FRAME", 36)
+    words = [40 if word == 0 else word for word in QUICK if word != "--no-paper"]
     run = in_process("bench", folder, "--match", "first", "--out", tmp_path, "--model", weights, *words)
     assert run.code == 0, run.err
     found = json.loads((tmp_path / "results.json").read_text("utf-8"))
@@ -153,6 +163,9 @@ def test_an_unscored_network_has_a_time_and_no_error(folder: Path, tmp_path: Pat
     for name in ("PIXELGATHER", "SAMPLESPLAT", "LAYER", "LAYER_w", "OPTIMIZED"):
         assert rows[f"{name} (untrained)"]["scores"] is None
         assert rows[f"{name} (untrained)"]["cpu"]["unet"] > 0.0
+        assert rows[f"{name} (untrained)"]["megapixels"] == 36 * 36 / 1e6
+    assert rows["lbmc tiny"]["megapixels"] == 40 * 40 / 1e6
+    assert "on 36 x 36 pixels of it" in run.out
     assert {p["network"] for p in found["growth"] if p["cpu"]} == {"LAYER", "SAMPLESPLAT", "lbmc tiny"}
     assert re.search(r"\| LAYER \(untrained\) \| – \|", run.out)
 

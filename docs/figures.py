@@ -1,0 +1,165 @@
+#!/usr/bin/env python3
+"""Draws the charts of README.md and docs/results.md from measured results; computes nothing itself.
+
+    python docs/figures.py [RESULTS.json] [--out FOLDER]
+
+RESULTS.json is what `lbmc bench` wrote, results.json of this repository if none is named. Charts go to docs/images:
+speed.png (time against error), growth.png (cost from 4 to 64 samples per pixel), and, from docs/results/samples.json,
+samples.png (error against samples per pixel). Needs the extra `bench`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("agg")
+
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullLocator
+
+from model.metrics import geometric_mean
+from pipelines.bench.charts import Style, number
+from pipelines.bench.report import styles
+from pipelines.bench.results import Results, pareto
+from pipelines.bench.tables import FULL_HD, front_points
+
+HOME = Path(__file__).resolve().parents[1]
+MARKERS = {"circle": "o", "square": "s", "triangle": "^", "diamond": "D"}
+GROWING = {"LAYER": "#2c5aa0", "SAMPLESPLAT": "#c0504d"}
+"""The networks of the paper's Figure 10, and their colours."""
+PLAIN = Style("#8a8f98", "diamond")
+
+
+def load(path: Path) -> Results:
+    """What `lbmc bench` wrote."""
+    return Results.from_dict(json.loads(path.read_text("utf-8")))
+
+
+def speed(results: Results) -> Figure:
+    """Time against error over the largest group of scenes, both logarithmic, with the Pareto front."""
+    samples = results.groups()[0]
+    points = {name: (seconds * FULL_HD, error) for name, (seconds, error) in front_points(results, samples).items()}
+    looks = styles(results.methods)
+    noisy = next((row.scores["relmse"] for name, row in results.summary(samples).items() if name == "noisy"), None)
+    figure, axes = plt.subplots(figsize=(8, 4.6), dpi=110)
+    front = [points[name] for name in pareto(points)]
+    stairs = [(x, y) for (x0, y0), (x1, _) in zip(front, front[1:], strict=False) for x, y in ((x0, y0), (x1, y0))]
+    axes.plot(*zip(*stairs, front[-1], strict=True), color="#c9ced6", lw=2, zorder=1, label="Pareto front")
+    if noisy is not None:
+        axes.axhline(noisy, color=PLAIN.color, lw=1, ls=":", label="noisy")
+    for name, (seconds, error) in points.items():
+        look = looks[name]
+        axes.plot(seconds, error, MARKERS[look.shape], color=look.color, ms=9, zorder=3)
+        axes.annotate(name, (seconds, error), xytext=(8, 6), textcoords="offset points", fontsize=9)
+    _log_axes(axes, "CPU seconds at 1920 x 1080 (one thread)" if results.machine["threads"] == 1 else
+              "CPU seconds at 1920 x 1080", "relMSE")
+    axes.set_xlim(right=max(x for x, _ in points.values()) * 2.5)
+    count = len(results.scenes_of(samples))
+    axes.set_title(f"Time against error: {count} scenes, {samples} samples per pixel", fontsize=11, loc="left")
+    axes.legend(frameon=False, fontsize=9, loc="upper right")
+    return figure
+
+
+def growth(results: Results) -> Figure:
+    """Multiply-adds and measured time per pixel, 4 to 64 samples: the paper's networks, and ours."""
+    figure, (counted, timed) = plt.subplots(1, 2, figsize=(10, 4.2), dpi=110)
+    ours = [spec.name for spec in results.methods if spec.family == "lbmc"]
+    looks = {**GROWING, **dict(zip(ours, ("#2f9e6e", "#7a5bd6", "#e39b2d"), strict=False))}
+    for name, color in looks.items():
+        rows = sorted((point.samples, point.multiply_adds, point.cpu) for point in results.growth
+                      if point.network == name)
+        _line(counted, name, color, [(n, 1e-6 * products) for n, products, _ in rows])
+        _line(timed, name, color, [(n, 1e6 * seconds) for n, _, seconds in rows if seconds is not None])
+    for axes, label, title in ((counted, "million multiply-adds per pixel", "Counted"),
+                               (timed, "CPU microseconds per pixel", "Measured")):
+        _log_axes(axes, "samples per pixel", label, sorted({point.samples for point in results.growth}))
+        axes.set_title(title, fontsize=11, loc="left")
+        axes.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def by_samples(results: Results) -> Figure:
+    """Error against samples per pixel, geometric means over the scenes of the largest group."""
+    figure, axes = plt.subplots(figsize=(8, 4.6), dpi=110)
+    looks = styles(results.methods)
+    for name, points in error_by_samples(results).items():
+        look = looks[name]
+        axes.plot(*zip(*points.items(), strict=True), MARKERS[look.shape] + "-", color=look.color, ms=6, label=name)
+    counts = sorted({n for points in error_by_samples(results).values() for n in points})
+    _log_axes(axes, "samples per pixel", "relMSE", counts)
+    axes.set_title(f"Error against samples per pixel: {len(results.scenes)} scenes, nested subsets", fontsize=11,
+                   loc="left")
+    axes.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def error_by_samples(results: Results) -> dict[str, dict[int, float]]:
+    """relMSE of each method at 1, 2, 4, ... samples and at the scenes' own number: geometric means over scenes."""
+    own = results.groups()[0]
+    errors: dict[str, dict[int, list[float]]] = {}
+    for point in results.curve:
+        errors.setdefault(point.method, {}).setdefault(point.samples, []).append(point.relmse)
+    for row in results.measurements:
+        if row.scores and row.method in errors:
+            errors[row.method].setdefault(own, []).append(float(row.scores["relmse"] or 0.0))
+    return {name: {n: geometric_mean(values) for n, values in sorted(by.items())} for name, by in errors.items()}
+
+
+def _line(axes: Axes, name: str, color: str, points: Sequence[tuple[float, float]]) -> None:
+    if points:
+        axes.plot(*zip(*points, strict=True), "o-", color=color, ms=5, label=name)
+
+
+def _log_axes(axes: Axes, x: str, y: str, ticks: Sequence[float] = ()) -> None:
+    """Both logarithmic, with ticks that read as numbers."""
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    plain = FuncFormatter(lambda value, _: number(value))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(plain)
+        axis.set_minor_formatter(FuncFormatter(lambda value, _: number(value) if f"{value:e}"[0] in "25" else ""))
+        axis.set_tick_params(which="both", labelsize=8)
+    if ticks:
+        axes.set_xticks(list(ticks))
+        axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.grid(True, which="both", color="#eceef2", lw=0.8)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
+def save(figures: Mapping[str, Figure], folder: Path) -> None:
+    """As PNGs that depend on the data alone."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, figure in figures.items():
+        figure.tight_layout()
+        figure.savefig(folder / f"{name}.png", metadata={"Software": None})
+        plt.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("results", nargs="?", type=Path, default=HOME / "results.json")
+    parser.add_argument("--out", type=Path, default=HOME / "docs" / "images")
+    options = parser.parse_args()
+    results = load(options.results)
+    figures = {"speed": speed(results)}
+    if results.growth:
+        figures["growth"] = growth(results)
+    samples = HOME / "docs" / "results" / "samples.json"
+    if samples.exists():
+        figures["samples"] = by_samples(load(samples))
+    save(figures, options.out)
+
+
+if __name__ == "__main__":
+    main()
