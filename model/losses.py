@@ -10,7 +10,8 @@ Every term is a mean over the crops, so the loss of a batch is the mean of the l
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
@@ -26,15 +27,17 @@ SRGB_LINEAR, SRGB_SLOPE, SRGB_SCALE, SRGB_OFFSET, SRGB_POWER = 0.0031308, 12.92,
 class LossWeights:
     """How much each term counts; a term of weight 0 is not computed."""
 
-    smape: float = field(default=0.5, metadata={"about": "SMAPE, the paper's loss: |d - y| / (|d| + |y| + 0.01)"})
-    relative: float = field(default=0.2, metadata={
-        "about": "log of a crop's relative squared error (d - y)^2 / (d^2 + 0.01), d^2 a constant, outliers saturated; "
-                 "a hard crop counts no more than an easy one"})
-    noise2noise: float = field(default=0.0, metadata={
-        "about": "the same error, plain: neither logarithm nor saturation, safe for noisy references"})
-    tone_mapped: float = field(default=0.0, metadata={"about": "squared error of pictures as sRGB of log(1 + x)"})
-    pooled: tuple[tuple[int, float], ...] = field(default=((8, 0.5), (32, 0.5)), metadata={
-        "about": "pairs of a cell size in pixels and the weight of the SMAPE of pictures averaged over such cells"})
+    smape: Annotated[float, "SMAPE, the paper's loss: |d - y| / (|d| + |y| + 0.01)"] = 0.5
+    relative: Annotated[
+        float, "log of a crop's squared error relative to the prediction, (d - y)^2 / (d^2 + 0.01), outliers cut: "
+               "a hard crop counts no more than an easy one"
+    ] = 0.2
+    noise2noise: Annotated[float, "the same error itself, not saturated: safe for noisy references"] = 0.0
+    tone_mapped: Annotated[float, "squared error of the pictures as sRGB of log(1 + x)"] = 0.0
+    pooled: Annotated[
+        tuple[tuple[int, float], ...],
+        "pairs of a cell size in pixels and the weight of the SMAPE of pictures averaged over such cells"
+    ] = ((8, 0.5), (32, 0.5))
 
 
 def smape(prediction: Tensor, target: Tensor) -> Tensor:

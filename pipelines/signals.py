@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
@@ -47,6 +47,30 @@ def stopped_by_signals() -> Iterator[None]:
         raise_if_stopped()
     finally:
         _received.clear()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def signals_noted() -> Iterator[Callable[[], int]]:
+    """While inside, SIGINT and SIGTERM interrupt nothing: the function given returns the first that came, 0 for none.
+
+    For jobs that must end between two steps; they raise StoppedError themselves once they have put things in order.
+    A signal that the parent process had ignored stays ignored.
+    """
+    noted: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: 0
+        return
+
+    def note(number: int, frame: FrameType | None) -> None:
+        noted.append(number)
+
+    heeded = [number for number in STOPPING if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, note) for number in heeded}
+    try:
+        yield lambda: noted[0] if noted else 0
+    finally:
         for number, handler in before.items():
             signal.signal(number, handler)
 

@@ -1,12 +1,14 @@
-"""Random training batches from a cache: crops, sample subsets, augmentation, as the model's `Samples`.
+"""Training batches from a cache: crops of random scenes and random subsets of their samples, as the model's `Samples`.
 
-Samples of a pixel were stored in random order, so any run of consecutive ones is a random subset.
+What the crops of a batch must agree on (scenes, number of samples, layers, roles) comes from (seed, step), everything
+else of a crop from (seed, step, its number): processes that share a batch make their crops without a word between them,
+and any number of processes makes the same ones.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -14,15 +16,26 @@ import torch
 from torch import Tensor
 
 from model.samples import Samples
-from pipelines.training.cache import CHANNELS, SampleCache, SceneEntry
-from pipelines.training.recipe import Augmentation, Recipe
+from pipelines.training.augment import Turn, relight
+from pipelines.training.cache import CHANNELS, SampleCache, SceneArrays, SceneEntry
+from pipelines.training.recipe import Odds, Recipe
 
-HalfArray = npt.NDArray[np.float16]
 FloatArray = npt.NDArray[np.float32]
+IndexArray = npt.NDArray[np.int64]
+
+MOST_SAMPLES = 1 << 20
 
 # Roles that may be missing from real files; radiance never is.
 DROPPABLE = ("depth", "normal", "albedo", "specular", "roughness", "motion", "coc", "lens", "time")
-DROP_EACH = 0.35  # of the roles, in a batch that loses some
+
+
+@dataclass
+class Crop:
+    """Some pixels of a scene: counts (P,) samples of each, values (N, C) float32, weight (N,), 1 over each pixel."""
+
+    counts: IndexArray
+    values: FloatArray
+    weight: FloatArray
 
 
 @dataclass
@@ -34,78 +47,70 @@ class Batch:
     scale: Tensor
     layers: int
 
-
-def _choose(rng: np.random.Generator, options: Sequence[tuple[int, float]]) -> int:
-    values, weights = zip(*options, strict=True)
-    return int(rng.choice(values, p=np.asarray(weights) / sum(weights)))
-
-
-def _mirror(samples: FloatArray) -> None:
-    """Negates the x of everything that has a direction on screen; the caller flips the columns."""
-    for role in ("normal", "motion", "lens"):
-        samples[..., CHANNELS[role].start] *= -1
+    def to(self, device: torch.device) -> Batch:
+        """The batch on a device."""
+        return Batch(move(self.samples, device), self.target.to(device), self.scale.to(device), self.layers)
 
 
-def _transpose(samples: FloatArray) -> None:
-    """Swaps screen x and y. Normals have y up where the screen has y down: (nx, ny) -> (-ny, -nx)."""
-    for role, sign in (("normal", -1), ("motion", 1), ("lens", 1)):
-        x = CHANNELS[role].start
-        samples[..., [x, x + 1]] = sign * samples[..., [x + 1, x]]
+def move(samples: Samples, device: torch.device) -> Samples:
+    """Samples on a device."""
+    if device == samples.weight.device:
+        return samples
+    return replace(samples, counts=samples.counts.to(device), weight=samples.weight.to(device),
+                   coverage=samples.coverage.to(device), roles={k: v.to(device) for k, v in samples.roles.items()})
 
 
-def _turn(rng: np.random.Generator, samples: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """One of the eight symmetries of the square."""
-    if rng.random() < 0.5:
-        samples, target = samples.swapaxes(0, 1), target.swapaxes(0, 1)
-        _transpose(samples)
-    if rng.random() < 0.5:
-        samples, target = samples[:, ::-1], target[:, ::-1]
-        _mirror(samples)
-    if rng.random() < 0.5:  # a vertical flip is a horizontal one between two transpositions
-        samples, target = samples[::-1], target[::-1]
-        for role in ("normal", "motion", "lens"):
-            samples[..., CHANNELS[role].start + 1] *= -1
-    return samples, target
+def take(arrays: SceneArrays, y: slice, x: slice, turn: Turn, count: int, share: float,
+         rng: np.random.Generator | None = None) -> Crop:
+    """A crop, turned, with `count` samples in every pixel; where pixels differ, with `share` of those each one has.
+
+    Samples of a scene weighted by `over` are all taken: they only mean something together. Which others, is drawn
+    from `rng`; without one, the first. The directions in the values are still those of the file.
+    """
+    if arrays.offsets is not None:
+        width = arrays.target.shape[1]
+        rows = np.arange(y.start, y.stop)[:, None]
+        pixels = turn.picture(rows * width + np.arange(x.start, x.stop)).ravel()
+        return _take_ragged(arrays, arrays.offsets, pixels, share, rng)
+    held = arrays.samples.shape[2]
+    first = 0 if rng is None else int(rng.integers(0, held))
+    block = turn.picture(arrays.samples[y, x])
+    if first + count > held:  # samples lie in a circle
+        chosen = block[:, :, (first + np.arange(count)) % held]
+    else:
+        chosen = block[:, :, first : first + count]
+    values = chosen.astype(np.float32, order="C").reshape(-1, chosen.shape[-1])
+    return Crop(np.full(len(values) // count, count, np.int64), values, np.full(len(values), 1 / count, np.float32))
 
 
-def _augment(
-    rng: np.random.Generator, samples: FloatArray, target: FloatArray, how: Augmentation
-) -> tuple[FloatArray, FloatArray, float]:
-    """Turns, recolours, rescales and litters one crop; returns it with the factor its radiance was multiplied by."""
-    if how.symmetries:
-        samples, target = _turn(rng, samples, target)
-    if how.permute_colors:
-        order = rng.permutation(3)
-        for role in ("radiance", "albedo", "specular"):
-            samples[..., CHANNELS[role]] = samples[..., CHANNELS[role]][..., order]
-        target = target[..., order]
-    gain = float(2.0 ** (rng.normal() * how.exposure_stops))
-    samples[..., CHANNELS["radiance"]] *= gain
-    if rng.random() < how.fireflies:
-        hit = rng.random(samples.shape[:3]) < 10 ** rng.uniform(-4.5, -3)
-        samples[hit, CHANNELS["radiance"]] *= 10 ** rng.uniform(1, 4.5, (int(hit.sum()), 1)).astype(np.float32)
-    return samples, target * np.float32(gain), gain
+def _take_ragged(arrays: SceneArrays, offsets: IndexArray, pixels: IndexArray, share: float,
+                 rng: np.random.Generator | None) -> Crop:
+    """The pixels of these numbers; the share is rounded at random, and no pixel that has samples loses them all."""
+    start = offsets[pixels]
+    held = offsets[pixels + 1] - start
+    if arrays.weight is not None:
+        counts, first = held, np.zeros_like(held)
+    else:
+        rounding = 0.5 if rng is None else rng.random(pixels.size)
+        counts = np.clip(np.floor(held * share + rounding).astype(np.int64), np.minimum(held, 1), held)
+        first = np.zeros_like(held) if rng is None else (rng.random(pixels.size) * held).astype(np.int64)
+    within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    circle = (within + np.repeat(first, counts)) % np.repeat(held, counts)
+    index = np.repeat(start, counts) + circle
+    if arrays.weight is not None:
+        weight = arrays.weight[index]
+    else:
+        weight = np.repeat(1 / np.maximum(counts, 1), counts).astype(np.float32)
+    return Crop(counts, arrays.samples[index].astype(np.float32), weight)
 
 
-def crop_samples(block: HalfArray, y: int, x: int, size: int, first: int, count: int) -> FloatArray:
-    """(size, size, count, C) float32: `count` consecutive samples from index `first` on, cyclically."""
-    part = block[y : y + size, x : x + size]
-    total = block.shape[2]
-    index = (first + np.arange(count)) % total
-    wrapped = first + count > total
-    chosen = part[:, :, index] if wrapped else part[:, :, first : first + count]
-    return chosen.astype(np.float32)
-
-
-def to_samples(crops: Sequence[FloatArray], roles: Sequence[str]) -> Samples:
-    """Crops (H, W, n, C) of one size and one n -> the model's input with the roles asked for."""
-    stacked = torch.from_numpy(np.ascontiguousarray(np.stack(crops)))  # (B, H, W, n, C)
-    batch, height, width, count, channels = stacked.shape
-    flat = stacked.view(-1, channels)
+def to_samples(crops: Sequence[Crop], roles: Sequence[str], height: int, width: int) -> Samples:
+    """Crops of one size -> the model's input with the roles asked for."""
+    flat = torch.from_numpy(np.concatenate([crop.values for crop in crops]))
     return Samples(
-        shape=(batch, height, width),
-        counts=torch.full((batch * height * width,), count, dtype=torch.int32),
-        weight=torch.full((flat.shape[0],), 1 / count),
+        shape=(len(crops), height, width),
+        counts=torch.from_numpy(np.concatenate([crop.counts for crop in crops]).astype(np.int32)),
+        weight=torch.from_numpy(np.concatenate([crop.weight for crop in crops])),
         coverage=flat[:, CHANNELS["coverage"]][:, 0].contiguous(),
         roles={role: flat[:, CHANNELS[role]].contiguous() for role in roles},
     )
@@ -116,26 +121,42 @@ def common_roles(entries: Sequence[SceneEntry]) -> list[str]:
     return [role for role in CHANNELS if role != "coverage" and all(role in entry.roles for entry in entries)]
 
 
-def random_batch(cache: SampleCache, entries: Sequence[SceneEntry], recipe: Recipe, seed: Sequence[int]) -> Batch:
-    """The batch that this seed names: crops of random scenes with one number of samples and one set of roles."""
-    rng = np.random.default_rng(seed)
-    chosen = [entries[int(k)] for k in rng.integers(0, len(entries), recipe.batch)]
-    count = min(_choose(rng, recipe.samples), min(entry.samples for entry in chosen))
-    layers = _choose(rng, recipe.layers)
-    roles = common_roles(chosen)
-    if rng.random() < recipe.augmentation.drop_roles:
-        roles = [role for role in roles if role not in DROPPABLE or rng.random() >= DROP_EACH]
+def crop_size(entries: Sequence[SceneEntry], recipe: Recipe) -> int:
+    """Pixels along the side of the crops that all of these scenes are large enough for."""
+    return min(recipe.crop, *(min(entry.height, entry.width) for entry in entries))
+
+
+def random_batch(cache: SampleCache, recipe: Recipe, step: int, part: slice = slice(None),
+                 entries: Sequence[SceneEntry] | None = None) -> Batch:
+    """The crops `part` of the batch of a step, the same whatever the other parts are; `entries` None: all scenes."""
+    entries = cache.entries if entries is None else entries
+    common = np.random.default_rng((recipe.seed, step))
+    chosen = [entries[int(k)] for k in common.integers(0, len(entries), recipe.batch)]
+    # the same number in every pixel where that can be, which the network is much faster on
+    count = min(_draw(common, recipe.samples), *(entry.samples for entry in chosen if not entry.ragged), MOST_SAMPLES)
+    layers = _draw(common, recipe.layers)
+    roles, how = common_roles(chosen), recipe.augmentation
+    if common.random() < how.drop_roles:
+        roles = [role for role in roles if role not in DROPPABLE or common.random() >= how.drop_each]
+    size = crop_size(entries, recipe)
     crops, targets, scales = [], [], []
-    for entry in chosen:
-        block, target = cache.arrays(entry)
-        size = min(recipe.crop, entry.height, entry.width)
-        y, x = (int(rng.integers(0, extent - size + 1)) for extent in (entry.height, entry.width))
-        first = int(rng.integers(0, entry.samples))
-        samples = crop_samples(block, y, x, size, first, count)
-        clean = np.array(target[y : y + size, x : x + size])
-        samples, clean, gain = _augment(rng, samples, clean, recipe.augmentation)
-        crops.append(samples)
-        targets.append(clean)
+    for number in range(recipe.batch)[part]:
+        # +1, since NumPy takes (seed, step) and (seed, step, 0) for the same seed
+        rng = np.random.default_rng((recipe.seed, step, number + 1))
+        entry = chosen[number]
+        arrays = cache.arrays(entry)
+        y, x = (slice(c, c + size) for c in (int(rng.integers(0, e - size + 1)) for e in (entry.height, entry.width)))
+        turn = Turn.draw(rng) if how.symmetries else Turn()
+        crop = take(arrays, y, x, turn, count, count / entry.samples, rng)
+        turn.directions(crop.values)
+        target, gain = relight(rng, crop.values, turn.picture(arrays.target[y, x]), how)
+        crops.append(crop)
+        targets.append(target)
         scales.append(entry.target_scale / gain)
     stacked = torch.from_numpy(np.ascontiguousarray(np.stack(targets))).permute(0, 3, 1, 2).contiguous()
-    return Batch(to_samples(crops, roles), stacked, torch.tensor(scales), layers)
+    return Batch(to_samples(crops, roles, size, size), stacked, torch.tensor(scales), layers)
+
+
+def _draw(rng: np.random.Generator, odds: Odds) -> int:
+    values, weights = zip(*odds, strict=True)
+    return int(rng.choice(values, p=np.asarray(weights) / sum(weights)))

@@ -1,72 +1,141 @@
-"""`lbmc train` as a function: caches the data, trains or resumes, and writes the averaged weights as a preset file."""
+"""`lbmc train` as a function: checks and caches the data, trains or resumes, writes the averaged weights."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
+import os
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
-from deep_io.errors import UsageError
+from deep_io.errors import InputError, UsageError
 from model import zoo
-from model.config import CONFIGS
-from pipelines.network import find_weights, load_network
-from pipelines.training.cache import SampleCache, build_cache
+from model.config import CONFIGS, Config
+from pipelines.training.batches import crop_size
+from pipelines.training.cache import CACHE_VERSION, SampleCache
+from pipelines.training.caching import build_cache, scene_files
+from pipelines.training.drawing import can_draw
+from pipelines.training.group import Group, joined
 from pipelines.training.loop import Trainer
 from pipelines.training.recipe import Recipe
+from pipelines.training.run_folder import RunFolder
 
-FEWEST_SCENES = 2
+FEWEST_SCENES, FEWEST_VALIDATION_SCENES = 2, 1
 
 
-def train(
-    data: Path,
-    validation: Path,
-    folder: Path,
-    preset: str,
-    recipe: Recipe,
-    start: Path | None = None,
-    threads: int | None = None,
-    seconds: float = math.inf,
-    report: Callable[[str], None] = print,
-) -> Path:
-    """Trains `preset` on the scenes of `data` and returns the weight file it wrote into `folder`.
+@dataclass(frozen=True)
+class TrainOptions:
+    """What to train on what, and how; only the recipe and the network change the weights.
 
-    Parameters
-    ----------
-    preset : a name of model.config.CONFIGS
-    data, validation : folders of NAME.deep.exr with NAME.ref.exr; decoded caches are kept beside them
-    folder : checkpoints, curve and weights; a checkpoint in it is resumed
+    data, validation : folders of NAME.deep.exr with NAME.ref.exr
+    out : folder of the run, see run_folder.py; a checkpoint in it is resumed
+    network : a name of model.config.CONFIGS
     start : weight file to start from instead of random weights
-    seconds : stop after this long, resumable
-
-    Raises InputError naming the file for data that cannot be trained on, before training starts.
+    cache : folder for the decoded data; None: beside each data folder, see cache_beside
+    device : auto, cpu or cuda
+    threads : of each process; None leaves PyTorch's choice
+    loaders : threads of each process that make batches
+    seconds : stop after so long, resumable
+    save_every : seconds between checkpoints; there is one at every validation, too
     """
-    if preset not in CONFIGS:
-        raise UsageError(f"no network {preset!r}; there are {', '.join(CONFIGS)}")
-    if threads is not None:
-        torch.set_num_threads(threads)
-    training = open_cache(data, report)
-    held_out = open_cache(validation, report)
-    if len(training.entries) < FEWEST_SCENES:
-        raise UsageError(f"{data}: {len(training.entries)} scene; training needs {FEWEST_SCENES} or more")
-    initial = load_network(find_weights(str(start))).state_dict() if start is not None else None
-    trainer = Trainer(CONFIGS[preset], recipe, folder, initial)
-    report(f"{len(training.entries)} scenes, {len(held_out.entries)} held out, from step {trainer.step}")
-    trainer.run(training, held_out, report, seconds)
-    info = {
-        "description": f"{preset}, trained by lbmc train",
-        "data": {"scenes": len(training.entries), "validation": len(held_out.entries)},
-        "recipe": dataclasses.asdict(recipe),
-        "steps": trainer.step,
-        "scores": trainer.rows[-1] if trainer.rows else {},
-    }
-    path = folder / f"{preset}{zoo.SUFFIX}"
-    zoo.save(trainer.averaged, path, info)
+
+    data: Path
+    validation: Path
+    out: Path
+    network: str = "fast"
+    recipe: Recipe = field(default_factory=Recipe)
+    start: Path | None = None
+    cache: Path | None = None
+    device: str = "auto"
+    threads: int | None = None
+    loaders: int = 1
+    seconds: float = math.inf
+    save_every: float = 600.0
+
+
+def train(options: TrainOptions, report: Callable[[str], None] = print) -> Path:
+    """Trains and returns the path of the weight file; under torchrun, one of its processes.
+
+    Raises InputError and UsageError, naming the file, for data, weights and checkpoints that cannot be used, before
+    training starts; StoppedError after SIGINT and SIGTERM, with a checkpoint written.
+    """
+    if options.network not in CONFIGS:
+        raise UsageError(f"--network {options.network}: there are {', '.join(CONFIGS)}")
+    config, recipe = CONFIGS[options.network], options.recipe
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    with joined(options.device) as group:
+        def say(text: str) -> None:
+            if group.leads:
+                report(text)
+
+        group.first(lambda: _prepare(options, config, group, say))
+        training, held_out = (SampleCache(folder) for folder in cache_folders(options))
+        start = starting_weights(options.start, config) if options.start is not None else None
+        trainer = Trainer(config, recipe, options.out, start, group)
+        say(f"{len(training.entries)} scenes, {len(held_out.entries)} held out, crops of "
+            f"{crop_size(training.entries, recipe)} pixels, {group.size} process{'es'[:2 * (group.size > 1)]} on "
+            f"{group.device.type}, from step {trainer.step}")
+        trainer.run(training, held_out, say, options.seconds, options.save_every, options.loaders)
+        info = {
+            "description": f"{options.network}, trained by lbmc train",
+            "data": {"scenes": len(training.entries), "validation": len(held_out.entries)},
+            "recipe": recipe.to_dict(),
+            "steps": trainer.step,
+            "scores": trainer.state.rows[-1] if trainer.state.rows else {},
+        }
+        path = options.out / f"{options.network}{zoo.SUFFIX}"
+        group.first(lambda: trainer.folder.write_weights(path, trainer.averaged, info))
+        say(f"wrote {path}")
     return path
 
 
+def _prepare(options: TrainOptions, config: Config, group: Group, report: Callable[[str], None]) -> None:
+    """Everything that can be refused, cheapest first; then the caches."""
+    if options.recipe.batch < group.size:
+        raise UsageError(f"a batch of {options.recipe.batch} crops for {group.size} processes; raise --batch or start "
+                         f"fewer")
+    scene_files(options.data, FEWEST_SCENES)
+    scene_files(options.validation, FEWEST_VALIDATION_SCENES)
+    if os.path.samefile(options.data, options.validation):
+        raise InputError(f"{options.validation}: is the training folder itself; scenes that were trained on say "
+                         f"nothing about others, so name a folder of other scenes")
+    if options.start is not None:
+        starting_weights(options.start, config)
+    RunFolder(options.out, config, options.recipe).read(torch.device("cpu"))
+    if not can_draw():
+        report("curve.png and panels are not drawn: pip install 'lbmc[train]'")
+    for source, folder in zip((options.data, options.validation), cache_folders(options), strict=True):
+        build_cache(source, folder, report, options.threads)
+
+
+def cache_folders(options: TrainOptions) -> tuple[Path, Path]:
+    """Where the decoded training and validation data are kept."""
+    if options.cache is not None:
+        return options.cache / "training", options.cache / "validation"
+    return cache_beside(options.data), cache_beside(options.validation)
+
+
+def cache_beside(source: Path) -> Path:
+    """The cache of a folder of scenes; versions of lbmc with other layouts do not share one."""
+    whole = source.resolve()
+    return whole.with_name(f"{whole.name}.cache-{CACHE_VERSION}")
+
+
 def open_cache(source: Path, report: Callable[[str], None]) -> SampleCache:
-    """The cache beside a folder of scenes (`FOLDER.cache`), brought up to date."""
-    return build_cache(source, source.with_name(source.name + ".cache"), report)
+    """The cache beside a folder of scenes, brought up to date. Raises InputError, see `build_cache`."""
+    return build_cache(source, cache_beside(source), report)
+
+
+def starting_weights(path: Path, config: Config) -> dict[str, Tensor]:
+    """The weights of a file. Raises UsageError where it is none, or of another network than `config`."""
+    try:
+        weights = zoo.find(str(path))
+        if {**weights.config.to_dict(), "name": ""} != {**config.to_dict(), "name": ""}:
+            raise ValueError(f"{path}: its network, {weights.config.name!r}, is not the {config.name!r} of --network")
+        return weights.load().state_dict()
+    except (ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"--start: {error}") from None

@@ -1,35 +1,37 @@
-"""The training loop: steps, averaged weights, validation, checkpoints that resume to the same curve."""
+"""The training loop: steps, averaged weights, validation, and when to save. One process, or a group of them."""
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import json
 import math
-import os
 import time
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from model.config import Config
 from model.denoiser import Denoiser
-from model.features import FrameScale
-from model.losses import EPSILON, smape, total_loss
-from pipelines.training.batches import Batch, common_roles, random_batch, to_samples
-from pipelines.training.cache import SampleCache, SceneEntry
+from model.losses import total_loss
+from pipelines.signals import StoppedError, signals_noted
+from pipelines.training.batches import Batch, random_batch
+from pipelines.training.cache import SampleCache
+from pipelines.training.group import ALONE, Group
 from pipelines.training.recipe import Recipe
+from pipelines.training.run_folder import RunFolder, State
+from pipelines.training.validation import UNIT, validate
 
-CHECKPOINT = "checkpoint.pt"
-CURVE = "curve.csv"
-UNIT = FrameScale()  # cached scenes are stored in exposure and depth units
-VALIDATION_SAMPLES = 8
-PREFETCH = 2  # batches made ahead
+TIME_IS_UP = 1  # below the numbers of the signals that end a run
+GUARDED = 1 / 3  # of the run, in which the guard against a collapsed partition fades
+BETAS = (0.9, 0.99)  # of Adam; steps are few and batches small, so its variance must not lag by a thousand steps
+
+Report = Callable[[str], None]
 
 
 def learning_rate(step: int, recipe: Recipe) -> float:
@@ -41,145 +43,162 @@ def learning_rate(step: int, recipe: Recipe) -> float:
     return recipe.learning_rate * (low + (1 - low) * 0.5 * (1 + math.cos(math.pi * done)))
 
 
-@dataclasses.dataclass(frozen=True)
-class Score:
-    """Validation with VALIDATION_SAMPLES samples: geometric mean relMSE, mean SMAPE, spread of the energy ratio."""
+class Objective(nn.Module):
+    """What a step minimises, as a module, so that DistributedDataParallel sees every parameter used."""
 
-    relmse: float
-    smape: float
-    energy: float  # mean over scenes of |mean(output) / mean(reference) - 1|
-    front: float  # mean visible weight of the first layer
+    def __init__(self, net: Denoiser, recipe: Recipe) -> None:
+        super().__init__()
+        self.net, self.recipe = net, recipe
 
-
-@torch.no_grad()
-def validate(net: Denoiser, cache: SampleCache, entries: Sequence[SceneEntry]) -> Score:
-    """Scores a network on whole scenes, the first VALIDATION_SAMPLES samples of each."""
-    errors, smapes, energies, fronts = [], [], [], []
-    for entry in entries:
-        block, target = cache.arrays(entry)
-        count = min(VALIDATION_SAMPLES, entry.samples)
-        samples = to_samples([np.asarray(block[:, :, :count]).astype(np.float32)], common_roles([entry]))
-        layers = net(samples, UNIT)
-        image = layers.beauty() * entry.target_scale
-        clean = torch.from_numpy(np.array(target)).permute(2, 0, 1)[None] * entry.target_scale
-        errors.append(float(((image - clean) ** 2 / (clean**2 + EPSILON)).mean()))
-        smapes.append(float(smape(image, clean)))
-        energies.append(abs(float(image.mean() / clean.mean()) - 1))
-        fronts.append(float(layers.weight[:, 0].mean()))
-    return Score(
-        math.exp(float(np.mean(np.log(errors)))), float(np.mean(smapes)), float(np.mean(energies)),
-        float(np.mean(fronts)),
-    )
+    def forward(self, batch: Batch, step: int) -> Tensor:
+        """The mean loss of the batch's crops, a scalar."""
+        layers = self.net(batch.samples, UNIT, batch.layers)
+        scale = batch.scale[:, None, None, None]
+        loss = total_loss(layers.beauty() * scale, batch.target * scale, self.recipe.loss_at(step))
+        guard = self.recipe.partition_entropy * max(0.0, 1 - step / (GUARDED * self.recipe.steps))
+        if guard > 0 and batch.layers > 1:
+            share = layers.weight.mean((2, 3)).clamp_min(1e-6)  # (B, L): a layer that is never used is lost
+            loss = loss + guard * (share * share.log()).sum(1).mean()
+        # processes must agree on which parameters have a gradient: all have one, if only 0
+        return loss + 0 * torch.stack([p.sum() for p in self.net.parameters()]).sum()
 
 
 class Trainer:
     """One run in one folder: `run()` continues from the folder's checkpoint if there is one.
 
-    Every batch depends on the seed and the step alone, so a resumed run repeats the uninterrupted one.
+    Every batch depends on the seed and the step alone, so a resumed run repeats the uninterrupted one, and any number
+    of processes makes the same steps.
+
+    Raises UsageError where the folder holds a checkpoint of another network or recipe, InputError where it is broken.
     """
 
-    def __init__(self, config: Config, recipe: Recipe, folder: Path, start: dict[str, Tensor] | None = None) -> None:
+    def __init__(self, config: Config, recipe: Recipe, folder: Path, start: dict[str, Tensor] | None = None,
+                 group: Group = ALONE) -> None:
         torch.manual_seed(recipe.seed)
-        self.recipe, self.folder = recipe, folder
+        self.recipe, self.group, self.folder = recipe, group, RunFolder(folder, config, recipe)
         self.net = Denoiser(config).set_product_dtype(torch.bfloat16 if recipe.bfloat16 else None)
         if start is not None:
             self.net.load_state_dict(start)
         self.averaged = Denoiser(config)
         self.averaged.load_state_dict(self.net.state_dict())
-        self.optimizer = torch.optim.Adam(self.net.parameters(), lr=recipe.learning_rate, betas=(0.9, 0.99))
-        self.step = 0
-        self.rows: list[dict[str, float]] = []
-        folder.mkdir(parents=True, exist_ok=True)
-        if (folder / CHECKPOINT).exists():
-            self._restore(torch.load(folder / CHECKPOINT, weights_only=True))
+        for net in (self.net, self.averaged):
+            net.to(group.device)
+        self.optimizer = torch.optim.Adam(self.net.parameters(), lr=recipe.learning_rate, betas=BETAS)
+        self.state = State()
+        found = self.folder.read(group.device)
+        if found is not None:
+            self.state = found.state
+            self.net.load_state_dict(found.net)
+            self.averaged.load_state_dict(found.averaged)
+            self.optimizer.load_state_dict(found.optimizer)
+        self.objective = group.wrap(Objective(self.net, recipe))
+        self._torn = False  # weights and step count belong to different steps
 
-    def _restore(self, state: dict[str, Any]) -> None:
-        self.net.load_state_dict(state["net"])
-        self.averaged.load_state_dict(state["averaged"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.step, self.rows = state["step"], state["rows"]
+    @property
+    def step(self) -> int:
+        """Steps done."""
+        return self.state.step
 
     def save(self) -> None:
-        """Writes the checkpoint and the curve, each whole or not at all."""
-        state = {
-            "net": self.net.state_dict(),
-            "averaged": self.averaged.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "step": self.step,
-            "rows": self.rows,
-            "config": json.dumps(self.net.config.to_dict()),
-            "recipe": json.dumps(dataclasses.asdict(self.recipe)),
-        }
-        temporary = self.folder / f"{CHECKPOINT}.part"
-        torch.save(state, temporary)
-        os.replace(temporary, self.folder / CHECKPOINT)
-        if self.rows:
-            with (self.folder / CURVE).open("w", newline="") as file:
-                writer = csv.DictWriter(file, fieldnames=list(self.rows[0]))
-                writer.writeheader()
-                writer.writerows(self.rows)
+        """Writes the checkpoint and the curve, each whole or not at all. The leading process does."""
+        if self.group.leads and not self._torn:
+            self.folder.write(self.state, self.net, self.averaged, self.optimizer)
 
-    def run(
-        self,
-        cache: SampleCache,
-        validation: SampleCache,
-        report: Callable[[str], None] = print,
-        seconds: float = math.inf,
-    ) -> None:
-        """Trains until `recipe.steps` or for `seconds`, validating and saving every `validate_every` steps.
+    def run(self, cache: SampleCache, validation: SampleCache, report: Report = print, seconds: float = math.inf,
+            save_every: float = math.inf, loaders: int = 1) -> None:
+        """Trains until `recipe.steps` or for `seconds`; validates by the recipe, saves then and every so many seconds.
 
-        A KeyboardInterrupt leaves a checkpoint of the last finished step.
+        SIGINT and SIGTERM end the run after the step they came in: raises StoppedError, once the checkpoint is
+        written. Whatever else ends it, the checkpoint is that of the last whole step. `loaders` threads make batches.
         """
-        begun = time.monotonic()
-        losses: list[float] = []
-        with ThreadPoolExecutor(1) as pool:
-            def ask(step: int) -> Any:
-                return pool.submit(random_batch, cache, cache.entries, self.recipe, (self.recipe.seed, step))
-
-            pending = [ask(self.step + k) for k in range(PREFETCH)]
+        begun = saved = time.monotonic()
+        stop = 0
+        with signals_noted() as signal, self._batches(cache, loaders) as batches:
             try:
-                while self.step < self.recipe.steps and time.monotonic() - begun < seconds:
-                    batch = pending.pop(0).result()
-                    pending.append(ask(self.step + PREFETCH))
-                    losses.append(self.update(batch))
-                    self.step += 1
-                    if self.step % self.recipe.validate_every == 0 or self.step == self.recipe.steps:
-                        self._log(losses, validation, time.monotonic() - begun, report)
-                        losses = []
+                while True:
+                    if self._due() and self.group.leads:
+                        self._validate(validation, report, signal, begun)
+                        saved = time.monotonic()
+                    stop = self.group.largest(signal() or (TIME_IS_UP if time.monotonic() - begun >= seconds else 0))
+                    if stop or self.step >= self.recipe.steps:
+                        break
+                    self.advance(next(batches))
+                    if time.monotonic() - saved >= save_every:
                         self.save()
+                        saved = time.monotonic()
             finally:
-                for future in pending:
-                    future.cancel()
                 self.save()
+        if stop > TIME_IS_UP:
+            raise StoppedError(stop)
 
-    def _log(self, losses: list[float], validation: SampleCache, elapsed: float,
-             report: Callable[[str], None]) -> None:
-        score = validate(self.averaged, validation, validation.entries)
-        row = {"step": float(self.step), "loss": float(np.mean(losses)), **dataclasses.asdict(score)}
-        self.rows.append(row)
+    @contextmanager
+    def _batches(self, cache: SampleCache, loaders: int) -> Iterator[Iterator[Batch]]:
+        """This process's part of the batches from the next step on, made ahead by `loaders` threads."""
+        part = self.group.part(self.recipe.batch)
+        pool = ThreadPoolExecutor(loaders)
+
+        def stream() -> Iterator[Batch]:
+            steps = iter(range(self.step, self.recipe.steps))
+            pending = deque(pool.submit(random_batch, cache, self.recipe, step, part)
+                            for step in islice(steps, loaders + 1))
+            while pending:
+                batch = pending.popleft().result()
+                for step in islice(steps, 1):
+                    pending.append(pool.submit(random_batch, cache, self.recipe, step, part))
+                yield batch
+
+        try:
+            yield stream()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+    def _due(self) -> bool:
+        """Whether the curve lacks the row of this step."""
+        step, rows = self.step, self.state.rows
+        due = step > 0 and (step % self.recipe.validate_every == 0 or step == self.recipe.steps)
+        return due and not (rows and rows[-1]["step"] >= step)
+
+    def _validate(self, cache: SampleCache, report: Report, signal: Callable[[], int], begun: float) -> None:
+        """Adds a row to the curve, saves and draws; a signal leaves that to the resumed run."""
+        result = validate(self.averaged, cache, self.recipe, signal)
+        if result is None:
+            return
+        score, shown = result
+        losses = np.array(self.state.losses)
+        finite = losses[np.isfinite(losses)]
+        row = {"step": float(self.step), "loss": float(finite.mean()) if finite.size else math.nan,
+               **dataclasses.asdict(score), "rate": learning_rate(self.step - 1, self.recipe),
+               "skipped": float(losses.size - finite.size)}
+        self.state.rows.append(row)
+        self.state.losses.clear()
+        self.save()
+        self.folder.draw(self.state, shown)
+        skipped = f"  {row['skipped']:.0f} steps skipped, not finite" if row["skipped"] else ""
         report(f"step {self.step}  loss {row['loss']:.4f}  relMSE {score.relmse:.5f}  SMAPE {score.smape:.5f}  "
-               f"energy off {score.energy:.4f}  front {score.front:.2f}  {elapsed:.0f} s")
+               f"energy off {score.energy:.4f}  front {score.front:.2f}  {time.monotonic() - begun:.0f} s{skipped}")
 
-    def update(self, batch: Batch) -> float:
-        """One step; returns its loss."""
-        recipe = self.recipe
-        rate = learning_rate(self.step, recipe)
+    def advance(self, batch: Batch) -> float:
+        """One step on this process's part of its batch; returns the loss of the whole batch, NaN for a skipped step."""
+        recipe, step = self.recipe, self.step
         for group in self.optimizer.param_groups:
-            group["lr"] = rate
-        layers = self.net(batch.samples, UNIT, batch.layers)
-        scale = batch.scale[:, None, None, None]
-        loss = total_loss(layers.beauty() * scale, batch.target * scale, recipe.loss)
-        guard = recipe.partition_entropy * max(0.0, 1 - 3 * self.step / recipe.steps)
-        if guard > 0 and batch.layers > 1:
-            share = layers.weight.mean((2, 3)).clamp_min(1e-6)  # (B, L): a layer that is never used is lost
-            loss = loss + guard * (share * share.log()).sum(1).mean()
+            group["lr"] = learning_rate(step, recipe)
+        # DistributedDataParallel takes the mean over processes, whose parts may differ by a crop
+        weight = len(batch.target) * self.group.size / recipe.batch
+        loss = weight * self.objective(batch.to(self.group.device), step)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.net.parameters(), recipe.clip)
+        mean = self.group.mean(loss)
+        self._torn = True
         if bool(torch.isfinite(norm)):
             self.optimizer.step()
-        keep = min(recipe.average, (1 + self.step) / (10 + self.step))
+        else:
+            mean = math.nan
+        keep = min(recipe.average, (1 + step) / (10 + step))
         with torch.no_grad():
             for mine, theirs in zip(self.averaged.parameters(), self.net.parameters(), strict=True):
                 mine.lerp_(theirs, 1 - keep)
-        return float(loss.detach())
+        self.state.losses.append(mean)
+        self.state.step += 1
+        self._torn = False
+        return mean

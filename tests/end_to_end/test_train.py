@@ -1,0 +1,228 @@
+"""`lbmc train` as a user runs it: several processes, signals and resuming, pictures, and what it refuses."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from deep_io.flat import write_flat
+from model import zoo
+from model.config import OPTIMIZED
+from model.denoiser import Denoiser
+from tests.pipelines.training_data import SIZE, uneven, write_example
+from tests.runner import LBMC, environment, in_process
+
+TORCHRUN = Path(sys.executable).parent / "torchrun"
+TWO = (TORCHRUN, "--standalone", "--nproc-per-node", "2", "--no-python")
+STEPS, EVERY = 6, 2
+QUICK = ("--steps", STEPS, "--validate-every", EVERY, "--batch", 3, "--crop", 32, "--threads", 1, "--set", "warmup=1",
+         "--set", "bfloat16=false")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Scenes in `data`, one of them adaptive, and one in `held`."""
+    folder = tmp_path_factory.mktemp("train")
+    for name in ("data", "held"):
+        (folder / name).mkdir()
+    write_example(folder / "data", "a", 1)
+    write_example(folder / "data", "b", 2)
+    write_example(folder / "data", "uneven", 3, uneven(3))
+    write_example(folder / "held", "c", 4)
+    return folder
+
+
+def command(folder: Path, out: str, before: tuple[object, ...] = ()) -> list[str]:
+    words = (*before, LBMC, "train", folder / "data", folder / out, "--validation", folder / "held", *QUICK)
+    return [str(word) for word in words]
+
+
+def run(folder: Path, out: str, before: tuple[object, ...] = ()) -> str:
+    done = subprocess.run(command(folder, out, before), capture_output=True, text=True, env=environment(), timeout=600)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def stopped(folder: Path, out: str, number: signal.Signals, before: tuple[object, ...] = ()) -> tuple[int, str]:
+    """Starts a run, sends it a signal after its first validation; returns how it ended and what it said to stderr.
+
+    The signal goes to the whole group of processes, as Ctrl-C on a terminal does.
+    """
+    process = subprocess.Popen(command(folder, out, before), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                               env=environment(), start_new_session=True)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith(f"step {EVERY}"):
+            os.killpg(process.pid, number)
+            break
+    _, err = process.communicate(timeout=600)
+    return process.returncode, err
+
+
+def curve(folder: Path, out: str) -> np.ndarray:
+    with (folder / out / "curve.csv").open() as file:
+        return np.array([[float(value) for value in row.values()] for row in csv.DictReader(file)])
+
+
+def step_of(folder: Path, out: str) -> int:
+    return int(torch.load(folder / out / "checkpoint.pt", weights_only=True)["step"])
+
+
+@pytest.fixture(scope="module")
+def whole(folder: Path) -> np.ndarray:
+    """The curve of a run that nothing interrupted, in one process."""
+    said = run(folder, "whole")
+    assert "3 scenes, 1 held out, crops of 32 pixels, 1 process on cpu, from step 0" in said
+    assert f"wrote {folder / 'whole' / 'fast.safetensors'}" in said
+    rows = curve(folder, "whole")
+    assert rows[:, 0].tolist() == [2, 4, 6]
+    return rows
+
+
+def test_two_processes_make_the_curve_and_the_weights_of_one(folder: Path, whole: np.ndarray) -> None:
+    said = run(folder, "two", TWO)
+    assert "2 processes on cpu" in said
+    assert said.count("step 2 ") == said.count("wrote ") == 1
+    np.testing.assert_allclose(curve(folder, "two"), whole, rtol=1e-3, atol=1e-5)
+    mine, theirs = (zoo.find(str(folder / out / "fast.safetensors")).load() for out in ("whole", "two"))
+    for a, b in zip(mine.parameters(), theirs.parameters(), strict=True):
+        torch.testing.assert_close(a, b, rtol=2e-2, atol=2e-3)
+
+
+@pytest.mark.parametrize(("number", "code", "word"), [(signal.SIGTERM, 143, "terminated"),
+                                                      (signal.SIGINT, 130, "interrupted")])
+def test_a_run_that_is_stopped_resumes_to_the_same_curve(
+    folder: Path, whole: np.ndarray, number: signal.Signals, code: int, word: str
+) -> None:
+    out = f"stopped{code}"
+    ended, err = stopped(folder, out, number)
+    assert ended == code, err
+    assert err.splitlines()[-1] == f"ERROR: {word}"
+    assert EVERY <= step_of(folder, out) < STEPS
+    assert not (folder / out / "fast.safetensors").exists()
+    said = run(folder, out)
+    assert f"from step {EVERY}" in said or f"from step {EVERY + 1}" in said
+    np.testing.assert_allclose(curve(folder, out), whole, rtol=1e-6)
+
+
+def test_a_group_that_is_stopped_resumes_to_the_same_curve_in_one_process(folder: Path, whole: np.ndarray) -> None:
+    ended, err = stopped(folder, "group", signal.SIGINT, TWO)
+    assert ended != 0
+    assert EVERY <= step_of(folder, "group") < STEPS, err
+    run(folder, "group")
+    np.testing.assert_allclose(curve(folder, "group"), whole, rtol=1e-3, atol=1e-5)
+
+
+def test_a_run_leaves_pictures_and_a_recipe_that_makes_the_same_run(folder: Path, whole: np.ndarray) -> None:
+    assert (folder / "whole" / "curve.png").read_bytes().startswith(b"\x89PNG")
+    assert len(list((folder / "whole" / "panels").glob("step*.png"))) == len(whole)
+    again = in_process("train", folder / "data", folder / "whole", "--validation", folder / "held", "--threads", 1,
+                       "--recipe", folder / "whole" / "recipe.json")
+    assert again.code == 0, again.err
+    assert "from step 6" in again.out
+
+
+def test_what_one_process_of_a_group_refuses_ends_all_with_one_line(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder / "data", tmp_path / "data")
+    (tmp_path / "data" / "b.ref.exr").unlink()
+    words = [*TWO, LBMC, "train", tmp_path / "data", tmp_path / "run", "--validation", folder / "held", *QUICK]
+    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, env=environment(), timeout=600)
+    assert done.returncode != 0
+    errors = [line for line in done.stderr.splitlines() if line.startswith("ERROR: ")]
+    assert len(errors) == 1
+    assert "b.ref.exr is missing" in errors[0]
+
+
+def lose_reference(data: Path, held: Path) -> None:
+    (data / "a.ref.exr").unlink()
+
+
+def shrink_reference(data: Path, held: Path) -> None:
+    write_flat(data / "a.ref.exr", dict.fromkeys("RGB", np.ones((SIZE, 7), np.float32)))
+
+
+def poison_reference(data: Path, held: Path) -> None:
+    write_flat(held / "c.ref.exr", dict.fromkeys("RGB", np.full((SIZE, SIZE), np.inf, np.float32)))
+
+
+def leave_one(data: Path, held: Path) -> None:
+    for path in [*data.glob("b.*"), *data.glob("uneven.*")]:
+        path.unlink()
+
+
+def leave_none_held(data: Path, held: Path) -> None:
+    for path in held.iterdir():
+        path.unlink()
+
+
+def hold_the_same(data: Path, held: Path) -> None:
+    shutil.rmtree(held)
+    held.symlink_to(data)
+
+
+def lose_data(data: Path, held: Path) -> None:
+    shutil.rmtree(data)
+
+
+@pytest.mark.parametrize(
+    ("damage", "named"),
+    [
+        (lose_reference, "data/a.deep.exr: its reference a.ref.exr is missing"),
+        (shrink_reference, "data/a.ref.exr: 7x40 pixels, but a.deep.exr has 40x40"),
+        (poison_reference, "held/c.ref.exr: NaN or Inf in the reference"),
+        (leave_one, "data: 1 scene; 2 or more are needed"),
+        (leave_none_held, "held: no *.deep.exr files"),
+        (hold_the_same, "held: is the training folder itself"),
+        (lose_data, "data: no such folder"),
+    ],
+)
+def test_unsuitable_data_end_in_one_line_before_training_starts(
+    folder: Path, tmp_path: Path, damage: Callable[[Path, Path], None], named: str
+) -> None:
+    data, held = tmp_path / "data", tmp_path / "held"
+    for name in ("data", "held"):
+        shutil.copytree(folder / name, tmp_path / name)
+    damage(data, held)
+    done = in_process("train", data, tmp_path / "run", "--validation", held, *QUICK)
+    assert done.code == 3
+    assert done.err.startswith("ERROR: ")
+    assert done.err.count("\n") == 1
+    assert named in done.err
+    assert not (tmp_path / "run").exists()
+
+
+def test_weights_recipes_and_folders_that_do_not_fit_are_refused_before_training_starts(
+    folder: Path, whole: np.ndarray, tmp_path: Path
+) -> None:
+    other = tmp_path / "other.safetensors"
+    zoo.save(Denoiser(OPTIMIZED), other, {})
+    (tmp_path / "file").write_text("")
+    start = ("train", folder / "data", tmp_path / "run", "--validation", folder / "held", *QUICK)
+    onto = ("train", folder / "data", folder / "whole", "--validation", folder / "held", *QUICK)
+    cases = [
+        ((*start, "--start", other), "other.safetensors: its network, 'optimized', is not the 'fast'"),
+        ((*start, "--start", tmp_path / "none.safetensors"), "none.safetensors: no such weight file"),
+        ((*onto, "--network", "optimized"), "whole/checkpoint.pt: its network, 'fast', is not the 'optimized'"),
+        ((*onto, "--seed", 5), "whole/checkpoint.pt: was made by another recipe (differs in seed)"),
+        ((*start, "--network", "huge"), "--network huge: there are layer"),
+        ((*start, "--set", "warmpu=3"), "no field warmpu"),
+        (("train", folder / "data", tmp_path / "file", "--validation", folder / "held", *QUICK), "file: is a file"),
+    ]
+    if not torch.cuda.is_available():
+        cases.append(((*start, "--device", "cuda"), "--device cuda:0: this machine shows 0 CUDA devices"))
+    for words, named in cases:
+        done = in_process(*words)
+        assert done.code == 2, done.err
+        assert done.err.startswith("ERROR: ")
+        assert named in done.err
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,333 @@
+"""The training loop on small real files: runs that resume, validation, curves and panels, checkpoints refused."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from deep_io.errors import InputError, UsageError
+from model import zoo
+from model.denoiser import Denoiser
+from model.losses import LossWeights
+from model.samples import Samples
+from pipelines.signals import StoppedError
+from pipelines.training.batches import Batch, random_batch
+from pipelines.training.cache import SampleCache
+from pipelines.training.caching import build_cache
+from pipelines.training.drawing import PANEL_PIXELS, curve_png, panel_png
+from pipelines.training.group import ALONE, Group
+from pipelines.training.job import TrainOptions, starting_weights, train
+from pipelines.training.loop import Trainer, learning_rate
+from pipelines.training.recipe import Augmentation, Recipe
+from pipelines.training.run_folder import CHECKPOINT, CURVE, CURVE_PICTURE, PANELS, RECIPE
+from pipelines.training.validation import pixel_means, validate
+from tests.pipelines.training_data import QUICK, SMALL, uneven, write_example
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes")
+    for number in range(2):
+        write_example(folder, f"scene{number}", number)
+    write_example(folder, "uneven", 2, uneven(2))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def cache(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> SampleCache:
+    return build_cache(scenes, tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture(scope="module")
+def whole(cache: SampleCache, tmp_path_factory: pytest.TempPathFactory) -> Trainer:
+    """A run of QUICK that nothing interrupted."""
+    trainer = Trainer(SMALL, QUICK, tmp_path_factory.mktemp("whole"))
+    trainer.run(cache, cache, lambda _: None)
+    return trainer
+
+
+def curve_of(trainer: Trainer) -> list[dict[str, float]]:
+    with (trainer.folder.folder / CURVE).open() as file:
+        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+
+
+def assert_same_run(one: Trainer, other: Trainer) -> None:
+    assert curve_of(one) == curve_of(other)
+    for mine, theirs in zip(one.averaged.parameters(), other.averaged.parameters(), strict=True):
+        assert torch.equal(mine, theirs)
+
+
+def test_the_learning_rate_warms_up_and_falls_to_its_floor() -> None:
+    recipe = Recipe(steps=100, warmup=10, learning_rate=1.0, final_rate=0.1)
+    rates = [learning_rate(step, recipe) for step in range(101)]
+    assert rates[0] == pytest.approx(0.1)
+    assert rates[9] == pytest.approx(1.0)
+    assert all(a >= b for a, b in zip(rates[10:-1], rates[11:], strict=True))
+    assert rates[100] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_a_run_stopped_anywhere_resumes_to_the_uninterrupted_one(
+    cache: SampleCache, tmp_path: Path, whole: Trainer, steps: int
+) -> None:
+    halved = Trainer(SMALL, QUICK, tmp_path)
+    for _ in range(steps):
+        halved.advance(random_batch(cache, QUICK, halved.step))
+    halved.save()
+    resumed = Trainer(SMALL, QUICK, tmp_path)
+    assert resumed.step == steps
+    resumed.run(cache, cache, lambda _: None)
+    assert_same_run(whole, resumed)
+
+
+def test_an_exception_leaves_a_checkpoint_of_the_last_whole_step(
+    cache: SampleCache, tmp_path: Path, whole: Trainer
+) -> None:
+    def fail(line: str) -> None:
+        raise OSError(line)
+
+    with pytest.raises(OSError, match="step 3"):
+        Trainer(SMALL, QUICK, tmp_path).run(cache, cache, fail)
+    resumed = Trainer(SMALL, QUICK, tmp_path)
+    assert resumed.step == 3
+    resumed.run(cache, cache, lambda _: None)
+    assert_same_run(whole, resumed)
+
+
+def test_a_signal_ends_the_run_after_its_step_and_is_told_once_everything_is_saved(
+    cache: SampleCache, tmp_path: Path, whole: Trainer
+) -> None:
+    class Signalled(Trainer):
+        def advance(self, batch: Batch) -> float:
+            if self.step == 1:
+                os.kill(os.getpid(), signal.SIGTERM)
+            return super().advance(batch)
+
+    handler = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(StoppedError) as stopped:
+        Signalled(SMALL, QUICK, tmp_path).run(cache, cache, lambda _: None)
+    assert stopped.value.number == signal.SIGTERM
+    assert signal.getsignal(signal.SIGTERM) is handler
+    resumed = Trainer(SMALL, QUICK, tmp_path)
+    assert resumed.step == 2
+    resumed.run(cache, cache, lambda _: None)
+    assert_same_run(whole, resumed)
+
+
+def test_a_signal_during_validation_leaves_that_to_the_resumed_run(
+    cache: SampleCache, tmp_path: Path, whole: Trainer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(net: Denoiser, *rest: Any) -> object:
+        os.kill(os.getpid(), signal.SIGINT)
+        return validate(net, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("pipelines.training.loop.validate", interrupted)
+        with pytest.raises(StoppedError):
+            Trainer(SMALL, QUICK, tmp_path).run(cache, cache, lambda _: None)
+    resumed = Trainer(SMALL, QUICK, tmp_path)
+    assert (resumed.step, resumed.state.rows) == (3, [])
+    resumed.run(cache, cache, lambda _: None)
+    assert_same_run(whole, resumed)
+
+
+def test_a_run_out_of_time_saves_and_says_nothing(cache: SampleCache, tmp_path: Path) -> None:
+    trainer = Trainer(SMALL, QUICK, tmp_path)
+    trainer.run(cache, cache, lambda _: None, seconds=0.0)
+    assert trainer.step == 0
+    assert (tmp_path / CHECKPOINT).exists()
+
+
+def test_checkpoints_are_written_between_validations_as_often_as_asked(
+    cache: SampleCache, tmp_path: Path
+) -> None:
+    saved = []
+
+    class Noting(Trainer):
+        def save(self) -> None:
+            saved.append(self.step)
+            super().save()
+
+    recipe = dataclasses.replace(QUICK, validate_every=100)
+    Noting(SMALL, recipe, tmp_path).run(cache, cache, lambda _: None, save_every=1e-6)
+    assert saved[:6] == [1, 2, 3, 4, 5, 6]
+
+
+def test_the_number_of_loaders_changes_nothing(cache: SampleCache, tmp_path: Path, whole: Trainer) -> None:
+    trainer = Trainer(SMALL, QUICK, tmp_path)
+    trainer.run(cache, cache, lambda _: None, loaders=3)
+    assert_same_run(whole, trainer)
+
+
+def test_parts_of_a_batch_weigh_as_much_as_their_crops(cache: SampleCache, tmp_path: Path) -> None:
+    """What DistributedDataParallel averages: the mean of the processes' gradients is that of the whole batch."""
+    def gradient(group: Group) -> torch.Tensor:
+        trainer = Trainer(SMALL, dataclasses.replace(QUICK, clip=1e9), tmp_path / "none")
+        trainer.group = _Silent(group.rank, group.size, group.device)
+        trainer.advance(random_batch(cache, QUICK, 0, group.part(QUICK.batch)))
+        return torch.cat([p.grad.flatten() for p in trainer.net.parameters() if p.grad is not None])
+
+    parts = [gradient(Group(rank, 2, torch.device("cpu"))) for rank in (0, 1)]
+    torch.testing.assert_close(sum(parts) / 2, gradient(ALONE), rtol=1e-4, atol=1e-6)
+
+
+class _Silent(Group):
+    """A process that hears of no other."""
+
+    def mean(self, value: torch.Tensor) -> float:
+        return float(value.detach())
+
+
+def test_every_parameter_gets_a_gradient_whatever_the_batch_lacks(cache: SampleCache, tmp_path: Path) -> None:
+    """Processes must agree on which parameters have one."""
+    recipe = dataclasses.replace(QUICK, layers=((1, 1.0),), augmentation=Augmentation(drop_roles=1.0, drop_each=1.0))
+    trainer = Trainer(SMALL, recipe, tmp_path)
+    trainer.advance(random_batch(cache, recipe, 0))
+    assert all(p.grad is not None for p in trainer.net.parameters())
+
+
+def test_training_lowers_the_loss_on_what_it_sees(cache: SampleCache, tmp_path: Path) -> None:
+    recipe = dataclasses.replace(QUICK, steps=24, batch=2, learning_rate=4e-3, samples=((4, 1.0),))
+    trainer = Trainer(SMALL, recipe, tmp_path)
+    batch = random_batch(cache, recipe, 0)
+    losses = [trainer.advance(batch) for _ in range(recipe.steps)]
+    assert np.mean(losses[-5:]) < np.mean(losses[:5]) - 0.05
+
+
+def test_the_finish_minimises_its_own_loss(cache: SampleCache, tmp_path: Path) -> None:
+    nothing = LossWeights(smape=0, relative=0, pooled=())
+    recipe = dataclasses.replace(QUICK, finish=0.5, finish_loss=nothing, partition_entropy=0.0)
+    trainer = Trainer(SMALL, recipe, tmp_path)
+    losses = [trainer.advance(random_batch(cache, recipe, step)) for step in range(recipe.steps)]
+    assert [loss != 0 for loss in losses] == [True] * 3 + [False] * 3
+
+
+def test_a_step_that_is_not_finite_is_skipped_and_counted(cache: SampleCache, tmp_path: Path) -> None:
+    trainer = Trainer(SMALL, dataclasses.replace(QUICK, steps=2, validate_every=2), tmp_path)
+    batch = random_batch(cache, QUICK, 0)
+    broken = dataclasses.replace(batch, target=torch.full_like(batch.target, torch.nan))
+    before = [p.clone() for p in trainer.net.parameters()]
+    assert np.isnan(trainer.advance(broken))
+    assert all(torch.equal(a, b) for a, b in zip(before, trainer.net.parameters(), strict=True))
+    told: list[str] = []
+    trainer.run(cache, cache, told.append)
+    assert trainer.state.rows[-1]["skipped"] == 1
+    assert "1 steps skipped" in told[-1]
+
+
+def test_validation_scores_output_and_input_against_the_reference(cache: SampleCache) -> None:
+    result = validate(Denoiser(SMALL), cache, QUICK)
+    assert result is not None
+    score, shown = result
+    scene = next(item for item in shown if item.name == "scene0")
+    entry = cache.entries[0]
+    arrays = cache.arrays(entry)
+    mean = arrays.samples[..., :3].astype(np.float32).mean(2) * entry.target_scale
+    np.testing.assert_allclose(scene.noisy, mean, rtol=1e-4)
+    np.testing.assert_allclose(scene.reference, arrays.target * entry.target_scale, rtol=1e-5)
+    errors = [((s.noisy - s.reference) ** 2 / (s.reference**2 + 0.01)).mean() for s in shown]
+    assert score.noisy_relmse == pytest.approx(float(np.exp(np.log(errors).mean())), rel=1e-4)
+    errors = [((s.denoised - s.reference) ** 2 / (s.reference**2 + 0.01)).mean() for s in shown]
+    assert score.relmse == pytest.approx(float(np.exp(np.log(errors).mean())), rel=1e-4)
+    assert score.front == pytest.approx(np.mean([s.front.mean() for s in shown]), rel=1e-4)
+
+
+def test_validation_takes_the_middle_of_large_scenes(cache: SampleCache) -> None:
+    result = validate(Denoiser(SMALL), cache, dataclasses.replace(QUICK, validation_size=32))
+    assert result is not None
+    middle = cache.arrays(cache.entries[0]).target[4:36, 4:36] * cache.entries[0].target_scale
+    np.testing.assert_allclose(result[1][0].reference, middle, rtol=1e-5)
+
+
+def test_pixels_without_samples_have_a_black_mean() -> None:
+    samples = Samples((1, 1, 2), torch.tensor([0, 2]), torch.full((2,), 0.5), torch.ones(2),
+                      {"radiance": torch.tensor([[1.0, 2.0, 3.0], [3.0, 4.0, 5.0]])})
+    assert pixel_means(samples)[0, :, 0].T.tolist() == [[0, 0, 0], [2, 3, 4]]
+
+
+def test_a_run_leaves_its_recipe_curve_and_panels(whole: Trainer) -> None:
+    folder = whole.folder.folder
+    assert sorted(path.name for path in folder.iterdir()) == sorted(
+        [CHECKPOINT, RECIPE, CURVE, CURVE_PICTURE, PANELS])
+    assert [row["step"] for row in curve_of(whole)] == [3, 6]
+    assert sorted(path.name for path in (folder / PANELS).iterdir()) == ["step000003.png", "step000006.png"]
+    for path in [folder / CURVE_PICTURE, *(folder / PANELS).iterdir()]:
+        with Image.open(path) as image:
+            assert image.width > 400
+        assert path.stat().st_size < 1_500_000
+
+
+def test_a_panel_shows_each_scene_in_five_pictures(cache: SampleCache) -> None:
+    result = validate(Denoiser(SMALL), cache, QUICK)
+    assert result is not None
+    shown = result[1]
+    with Image.open(io.BytesIO(panel_png(shown, 7))) as image:
+        pixels = np.asarray(image).astype(int)
+    times = PANEL_PIXELS // 40
+    assert pixels.shape[1] == 5 * (40 * times + 4)
+    reference = pixels[28:28 + 40 * times:times, 2 * (40 * times + 4):3 * (40 * times + 4) - 4:times]
+    assert reference[-1, 0, 0] > reference[0, 0, 0] + 50  # red grows downward in the scene
+    assert reference[0, -1, 1] > reference[0, 0, 1] + 20
+
+
+def test_a_panel_survives_a_network_that_has_diverged(cache: SampleCache) -> None:
+    result = validate(Denoiser(SMALL), cache, QUICK)
+    assert result is not None
+    broken = dataclasses.replace(result[1][0], denoised=np.full_like(result[1][0].denoised, np.nan))
+    assert panel_png([broken], 1)
+    rows = [{"step": float(k), "loss": np.nan, "relmse": np.nan, "smape": 0.1, "energy": 0.0, "front": 0.5,
+             "noisy_relmse": 1.0, "noisy_smape": 0.2, "rate": 1e-3} for k in range(3)]
+    assert curve_png(rows)
+
+
+def test_checkpoints_of_other_runs_and_broken_ones_are_refused_by_name(whole: Trainer, tmp_path: Path) -> None:
+    path = whole.folder.folder
+    with pytest.raises(UsageError, match=f"{CHECKPOINT}: its network, 'fast', is not"):
+        Trainer(dataclasses.replace(SMALL, generator=(16,)), QUICK, path)
+    other = dataclasses.replace(QUICK, seed=4, loss=LossWeights(smape=1.0))
+    with pytest.raises(UsageError, match=rf"{CHECKPOINT}: .*differs in loss.smape, seed\)"):
+        Trainer(SMALL, other, path)
+    broken = tmp_path / CHECKPOINT
+    for content in (b"", b"nothing", (path / CHECKPOINT).read_bytes()[:20000]):
+        broken.write_bytes(content)
+        with pytest.raises(InputError, match=f"{CHECKPOINT}: not a checkpoint"):
+            Trainer(SMALL, QUICK, tmp_path)
+    torch.save({"weights": 3}, broken)
+    with pytest.raises(InputError, match=f"{CHECKPOINT}: not a checkpoint"):
+        Trainer(SMALL, QUICK, tmp_path)
+
+
+def test_train_writes_weights_that_the_zoo_reads_and_training_starts_from(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held = tmp_path / "held"
+    held.mkdir()
+    write_example(held, "other", 9)
+    monkeypatch.setitem(train.__globals__["CONFIGS"], "small", SMALL)
+    options = TrainOptions(scenes, held, tmp_path / "run", "small", QUICK, cache=tmp_path / "cache", threads=1)
+    told: list[str] = []
+    path = train(options, told.append)
+    assert told[-1] == f"wrote {path}"
+    weights = zoo.find(str(path))
+    assert weights.info["steps"] == QUICK.steps
+    assert weights.info["data"] == {"scenes": 3, "validation": 1}
+    assert weights.info["recipe"] == QUICK.to_dict()
+    assert weights.config == SMALL
+    assert path.stat().st_mode == (tmp_path / "run" / RECIPE).stat().st_mode
+    assert (tmp_path / "cache" / "training" / "index.json").exists()
+    trained = starting_weights(path, SMALL)
+    again = Trainer(SMALL, QUICK, tmp_path / "second", trained)
+    for name, value in again.net.state_dict().items():
+        assert torch.equal(value, trained[name])
