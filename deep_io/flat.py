@@ -50,6 +50,7 @@ _ROWS_PER_CHUNK = {"none": 1, "rle": 1, "zips": 1, "zip": 16, "piz": 32, "pxr24"
 _NOT_KEPT = ("preview", "deepImageState")
 _NOT_KEPT_PREFIX = "lbmc:"
 HALF_MAX = 65504.0
+_NOT_WHOLE = "the disk took only a part of it; is it full?"
 
 
 @dataclass(frozen=True)
@@ -203,16 +204,33 @@ def _without_attributes(path: PathLike) -> BytesIO:
 
 
 def _set_attributes(path: PathLike, images: Sequence[FlatImage]) -> None:
-    """Give the headers of a finished file all the attributes of `images`."""
+    """Give the headers of a finished file all the attributes of `images`. Raises OSError where it is not whole."""
     with open(path, "r+b") as file:
-        written = parse_headers(file, os.fspath(path))
+        try:
+            written = parse_headers(file, os.fspath(path))
+        except InputError as error:
+            raise OSError(_NOT_WHOLE) from error
         headers = [replace(mine, attributes={**mine.attributes, **image.header.attributes})
                    for mine, image in zip(written.parts, images, strict=True)]
         file.seek(0)
-        whole = _with_headers(file.read(), written, headers)
+        whole = file.read()
+        _check_whole(whole, written)
         file.seek(0)
-        file.write(whole)
+        file.write(_with_headers(whole, written, headers))
         file.truncate()
+
+
+def _check_whole(whole: bytes, written: FileHeaders) -> None:
+    """Raises OSError unless the last chunk ends where the file does.
+
+    The library does not notice when the disk takes no more while it flushes its last bytes.
+    """
+    table = whole[written.end:written.end + 8 * sum(map(_chunk_count, written.parts))]
+    last = int(np.frombuffer(table, "<u8").max(initial=0))
+    size_at = last + 4 + 4 * written.multipart  # after [part number and] y
+    packed = int.from_bytes(whole[size_at:size_at + 4], "little")
+    if not last or size_at + 4 + packed != len(whole):
+        raise OSError(_NOT_WHOLE)
 
 
 def _with_headers(whole: bytes, written: FileHeaders, headers: Sequence[Header]) -> bytes:

@@ -7,6 +7,7 @@ the readers.
 from __future__ import annotations
 
 import os
+import stat
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -22,6 +23,7 @@ from deep_io.samples import DeepSamples, Window
 MAGIC = 20000630
 FORMAT_VERSION = 2
 TILED, LONG_NAMES, NON_IMAGE, MULTI_PART = 0x200, 0x400, 0x800, 0x1000
+FARTHEST = 2**30 - 1  # OpenEXR's own limit of a window's bounds
 SHORT_NAME_BYTES, LONG_NAME_BYTES = 31, 255
 
 PIXEL_TYPES = (np.dtype("<u4"), np.dtype("<f2"), np.dtype("<f4"))
@@ -122,8 +124,12 @@ def read_headers(path: str | os.PathLike[str]) -> list[Header]:
 
 
 def open_input(path: str | os.PathLike[str]) -> BinaryIO:
-    """Open a file for reading, with an InputError in place of an OSError."""
+    """Open a file for reading, with an InputError in place of an OSError and for what cannot be read back and forth."""
     try:
+        # Opening a pipe would wait for its writer, for ever if there is none.
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            what = "a folder" if os.path.isdir(path) else "a pipe or a device"
+            raise InputError(f"{os.fspath(path)}: is {what}, not a file; an EXR is read back and forth")
         return open(path, "rb")  # The caller closes it.
     except OSError as error:
         raise InputError(f"{os.fspath(path)}: cannot be opened: {error.strerror or error}") from error
@@ -205,6 +211,8 @@ def _header(raw: dict[str, Attribute], flags: int, path: str, index: int) -> Hea
         box = Window(*required(name, "box2i"))
         if box.width < 1 or box.height < 1:
             raise InputError(f"{where}: the header's {name} is empty: {box}")
+        if min(box.xmin, box.ymin) <= -FARTHEST or max(box.xmax, box.ymax) >= FARTHEST:
+            raise InputError(f"{where}: the header's {name} is beyond what EXR allows: {box}")
         return box
 
     kind = raw.pop("type").value if "type" in raw else ("tiledimage" if flags & TILED else "scanlineimage")

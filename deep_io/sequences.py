@@ -193,4 +193,6 @@ def _on_disk(source: PathLike, pattern: _Pattern) -> list[int]:
 
 
 def _why_no_file(path: PathLike) -> str:
-    return "is a folder, not an EXR" if os.path.isdir(path) else "no such file"
+    if os.path.exists(path):
+        return "is a folder, not an EXR" if os.path.isdir(path) else "is a pipe or a device, not a file"
+    return "no such file"

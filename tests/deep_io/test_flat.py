@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -172,6 +173,21 @@ def test_images_that_cannot_be_written_are_refused(tmp_path):
     with pytest.raises(OSError, match="absent"):
         write_flat(tmp_path / "absent" / "x.exr", {"R": grey})
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kept", [0, 0.3, 0.9, 0.999])
+@pytest.mark.parametrize("height", [3, 200])
+def test_a_disk_that_takes_only_a_part_is_an_error(tmp_path, height, kept):
+    """A small picture waits whole in the library's buffer, whose last flush nobody checks."""
+    path, pixels = tmp_path / "x.exr", picture(height=height)
+    write_flat(path, pixels)
+    _, most = before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(kept * path.stat().st_size), most))
+    try:
+        with pytest.raises(OSError, match=r"File too large|only a part of it"):
+            write_flat(path, pixels)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_half_clamps_and_counts():

@@ -1,5 +1,6 @@
 """Headers of every kind of EXR: parsed by our own code, encoded byte-exact."""
 
+import os
 import struct
 from dataclasses import replace
 from fractions import Fraction
@@ -210,6 +211,22 @@ def test_other_files_are_not_exrs(tmp_path, data):
 def test_a_missing_file_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match=r"nowhere\.exr: cannot be opened: No such file"):
         read_headers(tmp_path / "nowhere.exr")
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe.exr")
+    with pytest.raises(InputError, match=r"pipe\.exr: is a pipe or a device"):
+        read_headers(tmp_path / "pipe.exr")
+
+
+@pytest.mark.parametrize("window", [
+    Window(0, 0, 2**30 - 1, 0), Window(-(2**30) + 1, 0, 0, 0), Window(0, 0, 0, 2**31 - 1),
+])
+def test_windows_beyond_the_format_are_refused_as_openexr_refuses_them(tmp_path, window):
+    header = replace(header_of(), display_window=window)
+    (tmp_path / "a.exr").write_bytes(struct.pack("<iI", 20000630, 2) + encode_header(header))
+    with pytest.raises(InputError, match=r"a\.exr: the header's displayWindow is beyond"):
+        read_headers(tmp_path / "a.exr")
 
 
 def test_a_version_from_the_future_is_refused(tmp_path):
