@@ -1,5 +1,5 @@
 # make demo   denoise the examples           make test   linters, types, and the tests against the built wheel
-# make bench  speed against error on the examples, as a table and a page in build/bench
+# make bench  speed against error on the examples, as a table, a plot and a page in build/bench, against results.json
 # All make their own virtual environment in .venv and need nothing before them but Python 3.11 or newer.
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --quiet
 SOURCES := $(shell find deep_io lbmc_cli model pipelines -type f -not -path '*/__pycache__/*')
 TESTBED := build/testbed
 
-.PHONY: demo bench test lint clean
+.PHONY: demo bench bench-keep test lint clean
 .DEFAULT_GOAL := demo
 
 $(VENV)/made:
@@ -46,7 +46,11 @@ demo: $(VENV)/runtime
 	@PATH=$(BIN):$$PATH examples/demo.sh build/demo
 
 bench: $(VENV)/tested
-	@$(BIN)/lbmc bench examples/scenes --out build/bench --overwrite
+	@$(BIN)/python benchmarks/readme.py
+
+# The same, and its results become the repository's: results.json, the README's table and the charts.
+bench-keep: $(VENV)/tested
+	@$(BIN)/python benchmarks/readme.py --keep
 
 lint: $(VENV)/tested
 	$(BIN)/ruff check .

@@ -21,13 +21,13 @@ def write_reference(path: Path, rgb: np.ndarray, window: Window = WINDOW) -> Pat
     return path
 
 
-def write_pair(folder: Path, name: str, seed: int, samples: int = 4) -> DeepSamples:
+def write_pair(folder: Path, name: str, seed: int, samples: int = 4, window: Window = WINDOW) -> DeepSamples:
     """NAME.deep.exr with so many samples in every pixel, and a smooth picture of them as NAME.ref.exr."""
-    deep = full(noisy_scene(seed, WINDOW, 2), samples, seed)
+    deep = full(noisy_scene(seed, window, 2), samples, seed)
     write_scene(folder / f"{name}.deep.exr", deep)
     radiance = np.stack([deep.channels[channel].astype(np.float32) for channel in "RGB"], axis=-1)
     weight = np.full(deep.total, 1.0 / samples)
-    write_reference(folder / f"{name}.ref.exr", blur(pixel_means(deep.counts, weight, radiance)))
+    write_reference(folder / f"{name}.ref.exr", blur(pixel_means(deep.counts, weight, radiance)), window)
     return deep
 
 
