@@ -15,7 +15,8 @@ from lbmc_cli.options import LbmcCommand, option, part_choice, reading_options
 @option("--json", "as_json", is_flag=True, help="Print JSON.")
 @reading_options
 def info(source: str, as_json: bool, part: str | None, **choices: Any) -> None:
-    """Show IN's headers, which channels play which role, the weighting, and statistics of the samples."""
+    """Show IN's headers, which channels play which role, the weighting, statistics of the samples, and what a denoising
+    job would do without."""
     from pipelines.info import file_info
 
     found = file_info(source, part=part_choice(part), **choices)

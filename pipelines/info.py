@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from deep_io.csr import pixels_of
 from deep_io.header import Header, read_headers
 from deep_io.path_samples import PathSamples, SampleReader
+from pipelines.decisions import decide, zero_roles
 from pipelines.options import DepthKind, NormalSpace, WeightingName
+from pipelines.survey import Survey, Surveyor
 
 ROLES_OF_A_MISS = ("radiance", "coverage")
 """What a miss has too; the statistics of the other roles are over samples that hit something."""
@@ -102,6 +104,7 @@ class FileInfo:
     """Role to the channels it comes from."""
     weighting: str
     statistics: SampleStatistics
+    survey: Survey
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
@@ -111,6 +114,7 @@ class FileInfo:
             "part": self.part,
             "mapping": {role: list(channels) for role, channels in self.sources.items()},
             "weighting": self.weighting,
+            "decisions": decisions_as_dict(self.survey),
             **self.statistics.as_dict(),
         }
 
@@ -141,7 +145,7 @@ class FileInfo:
             text.append("repaired    " + ", ".join(f"{count} x {what}" for what, count in statistics.repairs.items()))
         else:
             text.append("repaired    nothing: every value is finite")
-        return text
+        return [*text, "a denoising job on this frame", *(f"  {line}" for line in decision_lines(self.survey))]
 
 
 def file_info(
@@ -159,12 +163,15 @@ def file_info(
     Raises InputError for what a denoising job would refuse, UsageError for options that do not fit the file.
     """
     headers = read_headers(path)
-    statistics = SampleStatistics()
+    statistics, surveyor = SampleStatistics(), None
     with SampleReader(
         path, part=part, overrides=overrides, weighting=weighting, normals=normals, depth=depth, camera=camera
     ) as reader:
         for block in reader.blocks():
+            surveyor = surveyor or Surveyor(reader.header.display_window)
             statistics.add(block)
+            surveyor.add(block)
+        assert surveyor is not None
         return FileInfo(
             path=os.fspath(path),
             headers=tuple(headers),
@@ -173,7 +180,35 @@ def file_info(
             sources={role: source.channels for role, source in reader.mapping.sources.items()},
             weighting=reader.weighting,
             statistics=statistics,
+            survey=surveyor.result(),
         )
+
+
+def decision_lines(seen: Survey) -> list[str]:
+    """What a job that this frame decides for would do without, for a reader; see docs/adapting.md."""
+    decided, zeros = decide(seen), sorted(zero_roles(seen) - decide(seen).held)
+    mixed = "" if seen.mixed is None else f": depth mixes in {seen.mixed:.1%} of the pixels"
+    return [
+        f"exposure {seen.exposure:.6g}, depth scale {seen.depth:.6g}",
+        f"layers {'1' if decided.one_layer else 'as many as the network has'}{mixed}",
+        *decided.lines(),
+        *([f"held, 0 in every sample: {' '.join(zeros)}"] if zeros else []),
+        *seen.cells.lines(),
+    ]
+
+
+def decisions_as_dict(seen: Survey) -> dict[str, Any]:
+    """The same in plain values; `layers` is null where it is the network's own number."""
+    decided = decide(seen)
+    return {
+        "exposure": seen.exposure,
+        "depth_scale": seen.depth,
+        "layers": 1 if decided.one_layer else None,
+        "mixed_depth": seen.mixed,
+        "held_roles": sorted(decided.held | zero_roles(seen)),
+        "cells": int(seen.cells.passed.size),
+        "cells_passed": int(seen.cells.passed.sum()),
+    }
 
 
 def header_as_dict(header: Header) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What the survey decides: one layer where no depth mixes, all of the network's where it does or is unknown."""
+"""What the survey decides: one layer where no depth mixes, roles held where they say nothing, once for a shot."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import pytest
 from deep_io import DeepSamples, Window
 from pipelines.denoise import Job
 from pipelines.options import DenoiseOptions
-from tests.end_to_end.scenes import random_weights, write_scene
+from pipelines.plan import FramePlan
+from tests.end_to_end.scenes import changed, noisy_scene, random_weights, rgb, write_scene
+from tests.runner import in_process
 
 
 def plane(mixed: bool, depth: bool = True) -> DeepSamples:
@@ -43,3 +45,83 @@ def test_layers_follow_the_scene(
     job = Job(DenoiseOptions(str(source), str(tmp_path / "out.exr"), model=str(weights), **choices))
     with job.open(source) as reader:
         assert job.plan(source, reader, lambda _: None).shot.layers == expected
+
+
+def moving(motion: float, blur: float = 0.0, seed: int = 0, last: float | None = None) -> DeepSamples:
+    """A noisy scene with a shutter: all hits move so many pixels and are blurred so much; `last` moves the last hit."""
+    samples = noisy_scene(seed)
+    hit = samples.channels["A"] > 0
+    along = np.where(hit, motion, 0.0).astype(np.float16)
+    if last is not None:
+        along[np.flatnonzero(hit)[-1]] = last
+    more = {"motion.X": along, "motion.Y": np.zeros_like(along), "coc": np.where(hit, blur, 0.0).astype(np.float16),
+            "time": np.random.default_rng(seed).uniform(0, 1, samples.total).astype(np.float16)}
+    return DeepSamples(samples.counts, {**samples.channels, **more}, samples.window)
+
+
+def planned(tmp_path: Path, samples: DeepSamples, adapt: bool = True) -> FramePlan:
+    source = write_scene(tmp_path / "in.deep.exr", samples)
+    weights = random_weights(tmp_path / "w.safetensors")
+    job = Job(DenoiseOptions(str(source), str(tmp_path / "out.exr"), model=str(weights), adapt=adapt))
+    with job.open(source) as reader:
+        return job.plan(source, reader, lambda _: None)
+
+
+@pytest.mark.parametrize(
+    ("motion", "blur", "held"),
+    [
+        (0.0, 0.0, {"coc", "lens", "motion", "time"}),
+        (0.05, 3.0, {"motion", "time"}),
+        (4.0, 0.01, {"coc", "lens"}),
+        (4.0, 3.0, set()),
+    ],
+)
+def test_roles_without_a_use_are_held(tmp_path: Path, motion: float, blur: float, held: set[str]) -> None:
+    plan = planned(tmp_path, moving(motion, blur))
+    assert plan.held == held
+    assert not held & {*plan.roles}
+    assert {*plan.roles} | held >= {"radiance", "depth", "motion", "time", "coc", "lens"}
+
+
+def test_one_moving_sample_in_the_last_row_keeps_motion_and_time(tmp_path: Path) -> None:
+    assert planned(tmp_path, moving(0.0, 3.0, last=0.25)).held == set()
+
+
+def test_a_role_that_is_zero_is_held_and_changes_nothing(tmp_path: Path) -> None:
+    samples = moving(4.0, 3.0)
+    black = {name: np.zeros(samples.total, np.float16) for name in ("albedo.R", "albedo.G", "albedo.B")}
+    samples = DeepSamples(samples.counts, {**samples.channels, **black}, samples.window)
+    assert planned(tmp_path, samples).held == {"albedo"}
+    found = [output(tmp_path, samples, *words) for words in ((), ("--no-adapt",))]
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-5, atol=1e-6)
+
+
+def output(folder: Path, samples: DeepSamples, *words: str) -> np.ndarray:
+    source, target = write_scene(folder / "a.exr", samples), folder / f"a{len(words)}.out.exr"
+    weights = random_weights(folder / "w.safetensors")
+    run = in_process("denoise", source, target, "--model", weights, "--pixel-type", "float", "--progress", "none",
+                     *words)
+    assert run.code == 0, run.err
+    return rgb(target)
+
+
+def test_no_adapt_holds_nothing_and_a_frame_without_hits_decides_nothing(tmp_path: Path) -> None:
+    assert planned(tmp_path, moving(0.0), adapt=False).held == set()
+    empty = changed(moving(0.0), A=np.zeros(moving(0.0).total, np.float16))
+    empty.channels["Z"][:] = 1e10
+    assert planned(tmp_path, empty).shot.decided.held == set()
+
+
+def test_the_first_frame_decides_and_a_later_one_that_differs_is_told_once(tmp_path: Path) -> None:
+    weights = random_weights(tmp_path / "w.safetensors")
+    for number, motion in ((1, 0.0), (2, 4.0), (3, 4.0)):
+        write_scene(tmp_path / f"in.000{number}.exr", moving(motion, 3.0, number))
+    words = ("--model", weights, "--pixel-type", "float", "--progress", "plain")
+    run = in_process("denoise", tmp_path / "in.####.exr", tmp_path / "out.####.exr", *words)
+    assert run.code == 0, run.err
+    assert run.err.count("has motion") + run.out.count("has motion") == 1
+    assert "in.0002.exr" in next(line for line in (run.err + run.out).splitlines() if "has motion" in line)
+    alone = in_process("denoise", tmp_path / "in.####.exr", tmp_path / "late.####.exr", *words, "--frames", "2-3",
+                       "--exposure-from", "1")
+    assert alone.code == 0, alone.err
+    assert (tmp_path / "late.0003.exr").read_bytes() == (tmp_path / "out.0003.exr").read_bytes()

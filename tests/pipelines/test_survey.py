@@ -86,3 +86,12 @@ def test_depth_mixes_where_surfaces_or_the_sky_share_a_pixel() -> None:
     counts = np.full((1, 4), 2, np.int32)
     seen = survey([PathSamples(counts, np.full(8, 0.5, np.float32), coverage, roles, Window(0, 0, 3, 0))])
     assert seen.mixed == 0.5
+
+
+def test_the_largest_of_a_role_is_followed_until_it_says_something() -> None:
+    block = frame()
+    block.roles["motion"] = np.full((block.total, 2), 0.01, np.float32)
+    block.roles["motion"][-1, 1] = -0.03
+    seen = survey([rows(block, 0, 20), rows(block, 20, 37)])
+    assert seen.largest == {"roughness": np.inf, "motion": pytest.approx(0.03)}
+    assert seen.hits == int((block.coverage > 0).sum())
