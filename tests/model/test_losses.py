@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -28,3 +29,54 @@ def test_the_total_is_the_weighted_sum_of_the_terms_asked_for() -> None:
     assert float(total_loss(one, other, smape)) == pytest.approx(2 / 4.01)
     toned = LossWeights(smape=0.0, relative=0.0, tone_mapped=2.0, pooled=())
     assert float(total_loss(one, other, toned)) == pytest.approx(2 * float(tone_mapped(one, other)))
+
+
+def minimum(weights: LossWeights, targets: torch.Tensor) -> float:
+    """The constant picture at which the gradient of the mean loss over noisy targets (B, 3, H, W) vanishes."""
+    low, high = 0.05, 3.0
+    for _ in range(14):
+        level = torch.tensor((low + high) / 2, requires_grad=True)
+        total_loss(level.expand_as(targets), targets, weights).backward()
+        assert level.grad is not None
+        low, high = (low, level.item()) if level.grad > 0 else (level.item(), high)
+    return (low + high) / 2
+
+
+def test_only_the_noise2noise_error_has_its_minimum_at_the_mean_of_noisy_targets() -> None:
+    generator = torch.Generator().manual_seed(1)
+    targets = -torch.log(torch.rand((4, 3, 16, 16), generator=generator).clamp_min(1e-6))  # mean 1, median 0.69
+    plain = LossWeights(smape=0.0, relative=0.0, pooled=())
+    assert minimum(replace(plain, noise2noise=1.0), targets) == pytest.approx(float(targets.mean()), rel=0.03)
+    assert minimum(replace(plain, smape=1.0), targets) < 0.9
+    assert minimum(replace(plain, tone_mapped=1.0), targets) < 0.95
+    assert minimum(replace(plain, pooled=((16, 1.0),)), targets) == pytest.approx(1.0, rel=0.06)
+
+
+def test_a_firefly_in_the_target_does_not_own_the_logarithmic_term() -> None:
+    weights = LossWeights(smape=0.0, relative=1.0, pooled=())
+    prediction = torch.full((1, 3, 8, 8), 0.5, requires_grad=True)
+    target = torch.full((1, 3, 8, 8), 0.6)
+    target[0, :, 4, 4] = 1e5
+    total_loss(prediction, target, weights).backward()
+    assert prediction.grad is not None
+    size = prediction.grad.abs()
+    assert float(size[0, 0, 4, 4]) < 200 * float(size[0, 0, 0, 0])
+
+
+def test_the_loss_of_a_batch_is_the_mean_of_its_crops_losses() -> None:
+    """Processes that share a batch rely on it."""
+    generator = torch.Generator().manual_seed(2)
+    prediction, target = (torch.rand((3, 3, 32, 32), generator=generator) for _ in range(2))
+    weights = LossWeights(noise2noise=0.3, tone_mapped=0.2)
+    parts = [float(total_loss(prediction[k : k + 1], target[k : k + 1], weights)) for k in range(3)]
+    assert float(total_loss(prediction, target, weights)) == pytest.approx(sum(parts) / 3, rel=1e-5)
+
+
+@pytest.mark.parametrize("term", ["smape", "relative", "noise2noise", "tone_mapped"])
+def test_a_black_prediction_has_a_finite_gradient(term: str) -> None:
+    weights = replace(LossWeights(smape=0.0, relative=0.0, pooled=()), **{term: 1.0})
+    prediction = torch.zeros((1, 3, 4, 4), requires_grad=True)
+    total_loss(prediction, picture(0.5), weights).backward()
+    assert prediction.grad is not None
+    assert torch.isfinite(prediction.grad).all()
+    assert bool((prediction.grad != 0).any())
