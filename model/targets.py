@@ -27,3 +27,13 @@ def sources_of(wanted: Tensor, windows: Sequence[int]) -> Tensor:
         cells = F.max_pool2d(cells_with(wanted, size).float(), window, 1, window // 2) > 0
         seen = seen | cells.repeat_interleave(size, -2).repeat_interleave(size, -1)[..., :height, :width]
     return seen
+
+
+def box_of(sources: Tensor) -> tuple[slice, slice]:
+    """Rows and columns, from the grid of TARGET_CELL on, that hold all of (B, H, W) bool, some of which are true."""
+    spans = []
+    for axis in (1, 2):
+        there = sources.any(0).any(2 - axis).nonzero()
+        first, last = int(there[0]) // TARGET_CELL * TARGET_CELL, int(there[-1]) // TARGET_CELL * TARGET_CELL
+        spans.append(slice(first, min(last + TARGET_CELL, sources.shape[axis])))
+    return spans[0], spans[1]
