@@ -7,6 +7,7 @@ renames. Knows nothing of what is written.
 from __future__ import annotations
 
 import os
+import re
 import secrets
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -17,6 +18,8 @@ from deep_io.errors import InputError, OutputError, UsageError
 
 PathLike = str | os.PathLike[str]
 Existing = Literal["refuse", "overwrite", "skip"]
+
+MOST_OF_STEM = 40  # characters: a name of the 255 bytes that file systems allow leaves no room for what is added
 
 
 def output_action(target: PathLike, inputs: Iterable[PathLike] = (), existing: Existing = "refuse") -> bool:
@@ -60,12 +63,14 @@ def atomic_output(target: PathLike) -> Iterator[Path]:
 
     On any exception, KeyboardInterrupt and whatever a signal handler raises included, the temporary file is removed
     and the target stays as it was. The name keeps the target's suffix, since libraries choose the format by it, and
-    begins with a dot, so that no sequence pattern finds it. Permissions follow the umask, or the file replaced.
+    begins with a dot, so that no sequence pattern finds it. Of the target's own name it has only a beginning in letters
+    that every library takes. Permissions follow the umask, or the file replaced.
     Raises InputError when the folder does not exist, OutputError in place of an OSError inside.
     """
     path = Path(target)
     _require_folder(path)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}-{secrets.token_hex(4)}.tmp{path.suffix}")
+    stem = re.sub(r"[^\w.-]", "_", path.stem)[:MOST_OF_STEM]
+    temporary = path.with_name(f".{stem}.{os.getpid()}-{secrets.token_hex(4)}.tmp{path.suffix}")
     try:
         yield temporary
         with suppress(FileNotFoundError):

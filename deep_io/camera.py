@@ -92,7 +92,8 @@ def parse_camera(text: str) -> Camera:
         content = Path(text).read_text("utf-8")
         values = json.loads(content) if content.lstrip().startswith("{") else {"worldToCamera": content.split()}
     except (OSError, ValueError) as error:
-        raise InputError(f"{text}: no camera: {error}; --camera takes degrees, an EXR, JSON or 16 numbers") from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{text}: no camera: {reason}; --camera takes degrees, an EXR, JSON or 16 numbers") from error
     unknown = set(values) - {"worldToCamera", "fieldOfView"}
     if unknown or not values:
         raise UsageError(f'{text}: a camera has "worldToCamera" and "fieldOfView", not {sorted(unknown) or "nothing"}')

@@ -9,8 +9,11 @@ from functools import partial
 from typing import Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 Options = TypeVar("Options")
+
+MOST_THREADS = 1024  # more than any machine has; far more crash the numeric libraries
 
 _UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
@@ -47,10 +50,24 @@ class LbmcOption(click.Option):
     """
 
     def resolve_envvar_value(self, ctx: click.Context) -> str | None:
+        name = self._variable(ctx)
+        return None if name is None else os.environ[name]
+
+    def process_value(self, ctx: click.Context, value: Any) -> Any:
+        try:
+            return super().process_value(ctx, value)
+        except click.BadParameter as error:
+            if self.name and ctx.get_parameter_source(self.name) is ParameterSource.ENVIRONMENT:
+                message = f"{error.message} (from the environment variable {self._variable(ctx)})"
+                raise click.BadParameter(message, ctx, self) from error
+            raise
+
+    def _variable(self, ctx: click.Context) -> str | None:
+        """The name of the variable that stands in for the option, None where none is set."""
         flag = next(name for name in self.opts if name.startswith("--")).lstrip("-").replace("-", "_").upper()
         contexts = (ctx, ctx.find_root())
         names = (f"{context.auto_envvar_prefix}_{flag}" for context in contexts if context.auto_envvar_prefix)
-        return next((os.environ[name] for name in names if os.environ.get(name)), None)
+        return next((name for name in names if os.environ.get(name)), None)
 
 
 option: Callable[..., Callable[[Any], Any]] = partial(click.option, cls=LbmcOption)
@@ -77,7 +94,7 @@ class Device(click.ParamType[str]):
     name = "device"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        if re.fullmatch(r"auto|cpu|cuda(:\d+)?", str(value)) is None:
+        if re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", str(value)) is None:
             self.fail(f"{value!r} is not auto, cpu, cuda or cuda:N", param, ctx)
         return str(value)
 
@@ -165,7 +182,10 @@ reading_options = together(
 """How a deep sample file is read; the same for every command that reads one."""
 
 THREADS = option(
-    "--threads", type=click.IntRange(1), metavar="N", help="CPU threads.  [default: all that the process may use]"
+    "--threads",
+    type=click.IntRange(1, MOST_THREADS),
+    metavar="N",
+    help="CPU threads.  [default: all that the process may use]",
 )
 PROGRESS = option(
     "--progress",

@@ -17,15 +17,16 @@ from deep_io.samples import DeepSamples
 WRITTEN = ("R", "G", "B", "A")  # the beauty's own channels
 
 
-def matching_channels(names: Sequence[str], wanted: Sequence[str], source: str) -> list[str]:
-    """Channels that a request names: a channel, a layer (all its channels) or a glob.
+def matching_channels(header: Header, wanted: Sequence[str], source: str) -> list[str]:
+    """Channels that a request names: a channel, a layer (all its channels) or a glob, which passes ids by.
 
     Raises InputError for a request that matches nothing; the message lists what there is.
     """
+    names, ids = header.channel_names, id_channels(header)
     found: list[str] = []
     for request in wanted:
-        matches = [name for name in names
-                   if name == request or name.startswith(f"{request}.") or fnmatchcase(name, request)]
+        matches = [name for name in names if name == request or name.startswith(f"{request}.")
+                   or (fnmatchcase(name, request) and name not in ids)]
         if not matches:
             raise InputError(f"{source}: no channel or layer {request!r} to keep; there are {', '.join(names)}")
         found += [name for name in matches if name not in found and name not in WRITTEN]
@@ -42,11 +43,17 @@ def find_kept(header: Header, weighting: str, wanted: Sequence[str], source: str
         return []
     if weighting != "uniform":
         raise UsageError(f"{source}: --keep averages samples of equal weight, these are weighted {weighting}")
-    names = matching_channels(header.channel_names, wanted, source)
-    ids = [channel.name for channel in header.channels if channel.name in names and channel.dtype.kind == "u"]
+    names = matching_channels(header, wanted, source)
+    ids = [name for name in id_channels(header) if name in names]
     if ids:
-        raise InputError(f"{source}: channel {ids[0]} holds ids, which cannot be averaged; leave it out of --keep")
+        raise InputError(f"{source}: channel {ids[0]} holds ids, which cannot be averaged; leave it out of --keep, and "
+                         f"pass --ids {ids[0]} to have them ranked")
     return names
+
+
+def id_channels(header: Header) -> list[str]:
+    """The channels of integers."""
+    return [channel.name for channel in header.channels if channel.dtype.kind == "u"]
 
 
 def kept_channels(

@@ -9,10 +9,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from deep_io.atomic import atomic_output, output_action
 from deep_io.errors import InputError, OutputError, UsageError
+from deep_io.flat import write_flat
 
 
 def test_the_output_appears_at_the_end_with_the_permissions_of_the_umask(tmp_path):
@@ -37,6 +39,13 @@ def test_the_permissions_of_a_replaced_file_are_kept(tmp_path):
         temporary.write_bytes(b"new")
     assert target.read_bytes() == b"new"
     assert target.stat().st_mode & 0o777 == 0o640
+
+
+@pytest.mark.parametrize("name", ["x" * 251 + ".exr", "ä" * 125 + ".exr", "b\udcffd.exr", "100% of #1.exr"])
+def test_every_name_that_the_file_system_takes_can_be_written_through_every_library(tmp_path, name):
+    with atomic_output(tmp_path / name) as temporary:
+        write_flat(temporary, {"R": np.zeros((2, 2), np.float16)})
+    assert os.listdir(tmp_path) == [name]
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])

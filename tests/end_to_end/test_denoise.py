@@ -217,6 +217,17 @@ def test_kept_channels_are_the_pixel_means_of_their_finite_values(weights: Path,
         np.testing.assert_allclose(channels[name], expected, rtol=1e-3, atol=1e-6)
 
 
+def test_a_glob_of_channels_to_keep_passes_ids_by_and_a_name_does_not(weights: Path, tmp_path: Path) -> None:
+    samples = noisy_scene(0, TINY)
+    source = write_scene(tmp_path / "in.exr", changed(samples, coid=np.arange(samples.total, dtype=np.uint32)))
+    words = ("denoise", source, tmp_path / "out.exr", "--model", weights, "--keep")
+    refused = in_process(*words, "coid")
+    assert refused.code == 3
+    assert "--ids coid" in refused.err
+    assert in_process(*words, "co*").code == 0
+    assert set(read_flat(tmp_path / "out.exr")[0]) == {"R", "G", "B", "A", "coc"}
+
+
 def test_values_beyond_half_are_clamped_counted_and_said(weights: Path, tmp_path: Path) -> None:
     samples = noisy_scene(5, TINY, dtype=np.float32)
     bright = {name: samples.channels[name] * np.float32(1e7) for name in "RGB"}

@@ -129,3 +129,19 @@ def test_wrong_values_are_usage_errors_that_say_what_is_right(arguments: list[st
     assert run.code == 2
     assert word in run.err
     assert run.err.count("\n") == 1
+
+
+def test_a_wrong_value_from_the_environment_names_its_variable() -> None:
+    words = ("denoise", "in.exr", "out.exr")
+    run = in_process(*words, env={"LBMC_DENOISE_MEMORY": "much"})
+    assert run.code == 2
+    assert "--memory" in run.err
+    assert "LBMC_DENOISE_MEMORY" in run.err
+    assert "environment" not in in_process(*words, "--memory", "much", env={"LBMC_MEMORY": "2GiB"}).err
+
+
+@pytest.mark.parametrize("words", [["--threads", "100000"], ["--device", "cuda:99999999999999999999"]])
+def test_numbers_that_crash_the_libraries_are_refused(words: list[str]) -> None:
+    run = in_process("denoise", "in.exr", "out.exr", *words)
+    assert run.code == 2
+    assert words[0] in run.err
