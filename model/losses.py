@@ -19,6 +19,7 @@ from torch import Tensor
 
 EPSILON = 0.01  # of both SMAPE and relative error, the metrics' own
 OUTLIER = 100.0  # relative squared errors saturate here: one firefly in a target must not own a step
+BEYOND = 4.0  # times a target that a prediction is measured by its own size; above that noise is no excuse
 LOG_FLOOR = 1e-3  # added to a crop's relative error before its logarithm
 SRGB_LINEAR, SRGB_SLOPE, SRGB_SCALE, SRGB_OFFSET, SRGB_POWER = 0.0031308, 12.92, 1.055, 0.055, 2.4
 
@@ -29,8 +30,8 @@ class LossWeights:
 
     smape: Annotated[float, "SMAPE, the paper's loss: |d - y| / (|d| + |y| + 0.01)"] = 0.5
     relative: Annotated[
-        float, "log of a crop's squared error relative to the prediction, (d - y)^2 / (d^2 + 0.01), outliers cut: "
-               "a hard crop counts no more than an easy one"
+        float, "log of a crop's squared error relative to the prediction, or to 4 times the reference where that is "
+               "less, outliers cut: a hard crop counts no more than an easy one"
     ] = 0.2
     noise2noise: Annotated[float, "the same error itself, not saturated: safe for noisy references"] = 0.0
     tone_mapped: Annotated[float, "squared error of the pictures as sRGB of log(1 + x)"] = 0.0
@@ -56,11 +57,13 @@ def noise2noise(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def log_relative(prediction: Tensor, target: Tensor) -> Tensor:
-    """Mean over crops of log(mean(relative_error) + 1e-3), outliers saturated.
+    """Mean over crops of log(mean((d - y)^2 / (m^2 + 0.01)) + 1e-3), m = min(|d|, 4 |y| + 0.1), outliers saturated.
 
-    The logarithm gives an easy crop and a hard one the same say, as the geometric mean over scenes does.
+    The logarithm gives an easy crop and a hard one the same say, as the geometric mean over scenes does. Relative to
+    the prediction alone, a lamp that leaks into the dark beside it would be an error of 1, however bright it is.
     """
-    error = relative_error(prediction, target)
+    scale = torch.minimum(prediction.detach().abs(), BEYOND * target.abs() + EPSILON**0.5)
+    error = (prediction - target).square() / (scale.square() + EPSILON)
     error = error / (1 + error.detach() / OUTLIER)
     return torch.log(error.mean((1, 2, 3)) + LOG_FLOOR).mean()
 

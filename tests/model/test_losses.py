@@ -80,3 +80,10 @@ def test_a_black_prediction_has_a_finite_gradient(term: str) -> None:
     assert prediction.grad is not None
     assert torch.isfinite(prediction.grad).all()
     assert bool((prediction.grad != 0).any())
+
+
+def test_a_lamp_that_leaks_into_the_dark_is_measured_by_the_dark() -> None:
+    relative = LossWeights(smape=0.0, relative=1.0, pooled=())
+    expected = 19.5**2 / (2.1**2 + 0.01)  # 4 * 0.5 + 0.1 rather than 20
+    saturated = math.log(expected / (1 + expected / 100) + 1e-3)
+    assert float(total_loss(picture(20.0), picture(0.5), relative)) == pytest.approx(saturated, rel=1e-5)
