@@ -1,0 +1,261 @@
+#!/usr/bin/env python3
+"""What modelling only what a scene needs saves, and what it costs: one row for each saving.
+
+    python benchmarks/bench_adapting.py FOLDER [--model fast] [--repeats 3] [--json OUT.json]
+
+FOLDER holds NAME.deep.exr with NAME.ref.exr. Each saving is measured on the scenes where the survey chooses it and,
+forced, on those where it does not. Scenes that need less are also made of the others: crops in which depth does not
+mix, and frames of several tiles whose upper half is plain sky or holds no samples. Time is the CPU time of the network,
+the runs with and without a saving taking turns, medians; error is relMSE, its ratio averaged geometrically.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import torch
+
+from deep_io.errors import LbmcError
+from deep_io.header import Header
+from deep_io.path_samples import PathSamples
+from deep_io.samples import Window
+from model.features import FrameScale
+from model.metrics import geometric_mean, score
+from pipelines.cells import Cells
+from pipelines.compare import read_rgb
+from pipelines.decisions import decide, zero_roles
+from pipelines.denoise import Job
+from pipelines.inference import denoise_bands
+from pipelines.options import DenoiseOptions
+from pipelines.survey import Survey, survey
+from pipelines.tiles import Band
+
+CROP = 96  # pixels along the side of a crop
+TILED = 384  # pixels along the side of a frame made of tiles, at least
+COMPANIONS = frozenset({"coc", "lens", "motion", "time"})
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A frame in memory, as the network's loop reads it; `reference` (H, W, 3), None where there is none."""
+
+    name: str
+    samples: PathSamples
+    reference: np.ndarray | None
+    seen: Survey
+
+    @staticmethod
+    def of(name: str, samples: PathSamples, reference: np.ndarray | None) -> Scene:
+        height, width = samples.counts.shape
+        samples = dataclasses.replace(samples, window=Window(0, 0, width - 1, height - 1))
+        return Scene(name, samples, reference, survey([samples]))
+
+
+class InMemory:
+    """A scene in the place of an open file, as far as `denoise_bands` looks at one."""
+
+    carried = carried_lights = 0
+
+    def __init__(self, scene: Scene) -> None:
+        self._samples = scene.samples
+        self.header = Header((), scene.samples.window, scene.samples.window)
+
+    def read(self, y0: int, y1: int) -> PathSamples:
+        """Rows y0 to y1, exclusive."""
+        return picked(self._samples, np.arange(y0, y1), np.arange(self._samples.counts.shape[1]))
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """What one run is told: layers (None: the network's), roles held or dropped, cells that pass, precision."""
+
+    layers: int | None = None
+    held: frozenset[str] = frozenset()
+    dropped: frozenset[str] = frozenset()
+    cells: Cells | None = None
+    dtype: torch.dtype | None = None
+
+
+@dataclasses.dataclass
+class Row:
+    """One line of the table: seconds without and with the saving, and ratios of errors where there is a reference."""
+
+    label: str
+    scenes: str
+    before: list[float] = dataclasses.field(default_factory=list)
+    after: list[float] = dataclasses.field(default_factory=list)
+    errors: list[float] = dataclasses.field(default_factory=list)
+    change: list[float] = dataclasses.field(default_factory=list)
+
+    def line(self) -> str:
+        saved = 1 - sum(self.after) / sum(self.before)
+        error = "-"
+        if self.errors:
+            error = f"{100 * (geometric_mean(self.errors) - 1):+.1f} % (worst {100 * (max(self.errors) - 1):+.1f} %)"
+        change = f"{max(self.change):.0e}" if self.change else "-"
+        return (f"| {self.label} | {self.scenes} | {len(self.before)} | {sum(self.before):.2f} | {100 * saved:.0f} % | "
+                f"{error} | {change} |")
+
+
+class Bench:
+    """Runs the network with and without each saving."""
+
+    def __init__(self, model: str, repeats: int) -> None:
+        self.job = Job(DenoiseOptions("", "", model=model, threads=1, progress="none"))
+        self.repeats = repeats
+
+    def load(self, path: Path) -> Scene:
+        with self.job.open(path) as reader:
+            return Scene.of(path.name.removesuffix(".deep.exr"), reader.read(), read_rgb(reference_of(path)).rgb)
+
+    def run(self, scene: Scene, choice: Choice) -> tuple[np.ndarray, float]:
+        """The beauty (H, W, 3), and CPU seconds."""
+        net, height = self.job.net.set_product_dtype(choice.dtype), scene.samples.counts.shape[0]
+        roles = tuple(r for r in net.config.roles if r in scene.samples.roles and r not in choice.held | choice.dropped)
+        reader = InMemory(scene)
+        begun = time.process_time()
+        layers = denoise_bands(reader, net, FrameScale(scene.seen.exposure, scene.seen.depth), roles,
+                               choice.layers or net.config.layers, [Band(0, height, 0, height)],
+                               held=choice.held & scene.samples.roles.keys(), cells=choice.cells)
+        return layers.beauty(), time.process_time() - begun
+
+    def measure(self, row: Row, scene: Scene, choice: Choice, kept: np.ndarray | None = None) -> None:
+        """Adds a scene to a row; `kept` (H, W): pixels whose largest relative change is looked at."""
+        runs: list[tuple[float, float]] = []
+        for _ in range(self.repeats):
+            (plain, before), (saving, after) = self.run(scene, Choice()), self.run(scene, choice)
+            runs.append((before, after))
+        row.before.append(median(before for before, _ in runs))
+        row.after.append(median(after for _, after in runs))
+        if scene.reference is not None:
+            errors = [score(picture, scene.reference, with_flip=False).relmse for picture in (saving, plain)]
+            row.errors.append(errors[0] / errors[1])
+        if kept is not None:
+            change = np.abs(saving - plain).max(-1) / (np.abs(plain).max(-1) + 1e-3 * plain.mean())
+            row.change.append(float(change[kept].max()))
+
+
+def reference_of(path: Path) -> Path:
+    return path.with_name(path.name.replace(".deep.exr", ".ref.exr"))
+
+
+def picked(samples: PathSamples, rows: np.ndarray, columns: np.ndarray) -> PathSamples:
+    """The pixels of some rows and columns, in that order, again and again if named so."""
+    width = samples.counts.shape[1]
+    pixels = (rows[:, None] * width + columns[None, :]).ravel()
+    counts = samples.counts.reshape(-1)[pixels]
+    before = samples.offsets[:-1][pixels] - (np.cumsum(counts) - counts)
+    index = np.repeat(before, counts) + np.arange(int(counts.sum()))
+    return dataclasses.replace(samples, counts=counts.reshape(len(rows), len(columns)), weight=samples.weight[index],
+                               coverage=samples.coverage[index],
+                               roles={role: values[index] for role, values in samples.roles.items()})
+
+
+def crops(scene: Scene) -> Iterator[Scene]:
+    """The first square of CROP pixels in which depth does not mix, if there is one: the survey chooses one layer."""
+    height, width = scene.samples.counts.shape
+    for top in range(0, height - CROP + 1, CROP // 3):
+        for left in range(0, width - CROP + 1, CROP // 3):
+            part = picked(scene.samples, np.arange(top, top + CROP), np.arange(left, left + CROP))
+            assert scene.reference is not None
+            crop = Scene.of(f"{scene.name} crop", part, scene.reference[top : top + CROP, left : left + CROP])
+            if decide(crop.seen).one_layer and crop.seen.hits > 0.5 * crop.seen.samples:
+                yield crop
+                return
+
+
+def halves(scene: Scene) -> tuple[Scene, Scene, Scene]:
+    """Tiles of a scene; the same under a plain sky; and with no samples in the sky's place."""
+    rows, columns = (np.tile(np.arange(size), -(-TILED // size)) for size in scene.samples.counts.shape)
+    whole = picked(scene.samples, rows, columns)
+    height, width = whole.counts.shape
+    upper = np.zeros((height, width), np.bool_)
+    upper[: height // 2] = True
+    inside = np.repeat(upper.ravel(), whole.counts.ravel())
+    roles = {role: np.where(inside[:, None], np.float32(0.5 if role == "radiance" else 0), values)
+             for role, values in whole.roles.items()}
+    sky = dataclasses.replace(whole, roles=roles, coverage=np.where(inside, np.float32(0), whole.coverage))
+    empty = dataclasses.replace(whole, counts=np.where(upper, 0, whole.counts).astype(np.int32),
+                                weight=whole.weight[~inside], coverage=whole.coverage[~inside],
+                                roles={role: values[~inside] for role, values in whole.roles.items()})
+    return (Scene.of(scene.name, whole, None), Scene.of(scene.name, sky, None), Scene.of(scene.name, empty, None))
+
+
+def table(bench: Bench, scenes: list[Scene], note: Callable[[str], None]) -> list[Row]:
+    """Every saving on every scene."""
+    rows: dict[tuple[str, str], Row] = {}
+
+    def row(label: str, where: str) -> Row:
+        return rows.setdefault((label, where), Row(label, where))
+
+    for scene in scenes:
+        note(scene.name)
+        decided, zeros, cells = decide(scene.seen), zero_roles(scene.seen), scene.seen.cells
+        for small in crops(scene):
+            bench.measure(row("1 layer", "chosen: crops where depth does not mix"), small, Choice(layers=1))
+        bench.measure(row("1 layer", "chosen" if decided.one_layer else "forced"), scene, Choice(layers=1))
+        for roles in (frozenset({"coc", "lens"}), frozenset({"motion", "time"})):
+            there = roles <= scene.samples.roles.keys()
+            where = "chosen" if roles <= decided.held else "forced"
+            label = " and ".join(sorted(roles))
+            if there:
+                bench.measure(row(f"{label} held", where), scene, Choice(held=roles))
+            if there and where == "chosen":
+                bench.measure(row(f"{label} absent instead", where), scene, Choice(dropped=roles))
+        if zeros - COMPANIONS:
+            bench.measure(row("roles of zeros held", "chosen"), scene, Choice(held=zeros - COMPANIONS))
+        passes = cells.passed.any() or cells.alike.any()
+        where = "chosen" if passes else "nothing passes"
+        bench.measure(row("cells pass", where), scene, Choice(cells=cells), ~cells.mask)
+        bench.measure(row("bf16 products", "all"), scene, Choice(dtype=torch.bfloat16))
+    for scene in scenes[:: max(len(scenes) // 4, 1)]:
+        full, *less = halves(scene)
+        for half, name in zip(less, ("plain sky above", "no samples above"), strict=True):
+            note(f"{scene.name}, {name}")
+            cells = half.seen.cells
+            bench.measure(row("cells pass", name), half, Choice(cells=cells), ~cells.mask)
+            whole, passed = row("cells pass", f"{name}, against a full frame"), []
+            for _ in range(bench.repeats):
+                whole_time, part_time = bench.run(full, Choice())[1], bench.run(half, Choice(cells=cells))[1]
+                passed.append((whole_time, part_time))
+            whole.before.append(median(a for a, _ in passed))
+            whole.after.append(median(b for _, b in passed))
+    return list(rows.values())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--model", default="fast")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    paths = [path for path in sorted(options.folder.glob("*.deep.exr")) if reference_of(path).exists()]
+    if not paths:
+        sys.exit(f"ERROR: {options.folder}: no NAME.deep.exr with a NAME.ref.exr beside it")
+    bench = Bench(options.model, options.repeats)
+    scenes = [bench.load(path) for path in paths]
+    rows = table(bench, scenes, lambda text: print(text, file=sys.stderr))
+    print("| saving | scenes | number | CPU s without | saved | relMSE | largest change outside |\n" + "|---" * 7 + "|")
+    print("\n".join(row.line() for row in rows))
+    if options.json:
+        decisions = {scene.name: {"one_layer": decide(scene.seen).one_layer, "held": sorted(decide(scene.seen).held),
+                                  "cells_passed": int(scene.seen.cells.passed.sum()),
+                                  "cells": int(scene.seen.cells.passed.size)} for scene in scenes}
+        options.json.write_text(json.dumps({"decisions": decisions, "rows": [dataclasses.asdict(row) for row in rows]},
+                                           indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except LbmcError as error:
+        sys.exit(f"ERROR: {error}")
