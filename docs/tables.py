@@ -10,10 +10,13 @@ A table stands between the lines `<!-- table: NAME -->` and `<!-- end -->` of RE
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import is_dataclass
 from pathlib import Path
+from typing import Any, get_type_hints
 
 from result_tables import RESULT_TABLES
 
@@ -22,6 +25,7 @@ from deep_io.roles import ROLES
 from lbmc_cli.main import COMMANDS
 from model.config import CONFIGS
 from model.cost import count
+from pipelines.training.recipe import Recipe
 
 HOME = Path(__file__).resolve().parent.parent
 DOCUMENTS = ("README.md", "docs/*.md")
@@ -92,6 +96,20 @@ def networks() -> str:
                      f"multiply-adds per pixel, {SAMPLES} samples"), rows)
 
 
+def recipe() -> str:
+    return markdown(("field", "default", "meaning"), ((f"`{n}`", f"`{v}`", t) for n, v, t in _fields(Recipe(), "")))
+
+
+def _fields(options: Any, prefix: str) -> Iterator[tuple[str, str, str]]:
+    """Name, default and meaning of each field of a recipe; fields of a part follow it."""
+    for name, hint in get_type_hints(type(options), include_extras=True).items():
+        value = getattr(options, name)
+        if is_dataclass(value):
+            yield from _fields(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", json.dumps(value), hint.__metadata__[0]
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "commands": commands,
     "roles": roles,
@@ -99,6 +117,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "renderers": renderers,
     "no-roles": no_roles,
     "networks": networks,
+    "recipe": recipe,
     **RESULT_TABLES,
 }
 

@@ -52,11 +52,12 @@ class Objective(nn.Module):
 
     def forward(self, batch: Batch, step: int) -> Tensor:
         """The mean loss of the batch's crops, a scalar."""
-        layers = self.net(batch.samples, UNIT, batch.layers)
+        wanted = min(batch.layers, self.net.config.partition_logits)
+        layers = self.net(batch.samples, UNIT, wanted)
         scale = batch.scale[:, None, None, None]
         loss = total_loss(layers.beauty() * scale, batch.target * scale, self.recipe.loss_at(step))
         guard = self.recipe.partition_entropy * max(0.0, 1 - step / (GUARDED * self.recipe.steps))
-        if guard > 0 and batch.layers > 1:
+        if guard > 0 and wanted > 1:
             share = layers.weight.mean((2, 3)).clamp_min(1e-6)  # (B, L): a layer that is never used is lost
             loss = loss + guard * (share * share.log()).sum(1).mean()
         # processes must agree on which parameters have a gradient: all have one, if only 0

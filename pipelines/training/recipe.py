@@ -55,7 +55,9 @@ class Recipe:
     samples: Annotated[
         Odds, "samples per pixel and how often a batch has so many; never more than a scene holds"
     ] = ((1, 0.05), (2, 0.1), (4, 0.25), (8, 0.45), (16, 0.15))
-    layers: Annotated[Odds, "layers and how often a batch uses so many"] = ((1, 0.1), (2, 0.75), (3, 0.15))
+    layers: Annotated[
+        Odds, "layers and how often a batch uses so many; never more than the network has"
+    ] = ((1, 0.1), (2, 0.75), (3, 0.15))
     loss: Annotated[LossWeights, "what is minimised"] = field(default_factory=LossWeights)
     finish: Annotated[float, "share of the run, its end, in which `finish_loss` takes over"] = 0.0
     finish_loss: Annotated[LossWeights | None, "what is minimised then; fields as those of `loss`"] = None

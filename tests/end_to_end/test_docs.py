@@ -22,7 +22,7 @@ COMMAND_LINE = re.compile(r"^ *lbmc ([a-z-]+)(.*)$", re.MULTILINE)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 VARIABLE = re.compile(r"\bLBMC_[A-Z_]+\b")
 PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
-OTHER_PROGRAMS = ("pip ", "python ", "oiiotool ", "blender ", "mitsuba ")
+OTHER_PROGRAMS = ("pip ", "python ", "oiiotool ", "blender ", "mitsuba ", "torchrun ")
 
 
 @cache

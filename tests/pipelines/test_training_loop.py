@@ -331,3 +331,9 @@ def test_train_writes_weights_that_the_zoo_reads_and_training_starts_from(
     again = Trainer(SMALL, QUICK, tmp_path / "second", trained)
     for name, value in again.net.state_dict().items():
         assert torch.equal(value, trained[name])
+
+
+def test_a_network_with_fewer_layers_than_a_batch_asks_for_uses_all_it_has(cache: SampleCache, tmp_path: Path) -> None:
+    recipe = dataclasses.replace(QUICK, layers=((3, 1.0),))
+    net = dataclasses.replace(SMALL, partition_logits=2)
+    assert np.isfinite(Trainer(net, recipe, tmp_path).advance(random_batch(cache, recipe, 0)))
