@@ -17,7 +17,14 @@ from lbmc_cli.options import LbmcCommand, option, part_choice, reading_options
 def info(source: str, as_json: bool, part: str | None, **choices: Any) -> None:
     """Show IN's headers, which channels play which role, the weighting, statistics of the samples, and what a denoising
     job would do without."""
-    from pipelines.info import file_info
+    from deep_io.errors import InputError
+    from pipelines.info import FileInfo, RefusedFile, file_info, refused_file
 
-    found = file_info(source, part=part_choice(part), **choices)
-    click.echo(json.dumps(found.as_dict(), indent=2) if as_json else "\n".join(found.lines()))
+    def show(found: FileInfo | RefusedFile) -> None:
+        click.echo(json.dumps(found.as_dict(), indent=2) if as_json else "\n".join(found.lines()))
+
+    try:
+        show(file_info(source, part=part_choice(part), **choices))
+    except InputError:  # whoever asks why a file is refused wants to see what is in it
+        show(refused_file(source, part_choice(part), choices["overrides"]))
+        raise

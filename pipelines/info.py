@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,8 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_io.csr import pixels_of
+from deep_io.deep_reader import DeepReader
+from deep_io.errors import LbmcError
 from deep_io.header import Header, read_headers
 from deep_io.path_samples import PathSamples, SampleReader
+from deep_io.role_matching import map_roles
 from pipelines.decisions import decide, zero_roles
 from pipelines.options import DepthKind, NormalSpace, WeightingName
 from pipelines.survey import Survey, Surveyor
@@ -120,14 +124,7 @@ class FileInfo:
 
     def lines(self) -> list[str]:
         """The same for a reader."""
-        text = [self.path]
-        for number, header in enumerate(self.headers):
-            mark = "*" if number == self.part else " "
-            text.append(f"{mark} part {number} {header.name!r}: {header.type}, {header.compression}")
-            text.append(f"    data window     {_window(header.data_window)}")
-            text.append(f"    display window  {_window(header.display_window)}, pixel aspect {header.pixel_aspect:g}")
-            text.append("    channels        " + " ".join(f"{c.name}:{c.dtype.name}" for c in header.channels))
-            text += [f"    {name:<15} {_short(stored.value)}" for name, stored in header.attributes.items()]
+        text = [self.path, *_header_lines(self.headers, self.part)]
         text += ["roles", *(f"  {line}" for line in self.mapping), f"weighting   {self.weighting}"]
         statistics = self.statistics
         text.append(f"pixels      {statistics.pixels}, {statistics.empty_pixels} without samples")
@@ -146,6 +143,36 @@ class FileInfo:
         else:
             text.append("repaired    nothing: every value is finite")
         return [*text, "a denoising job on this frame", *(f"  {line}" for line in decision_lines(self.survey))]
+
+
+@dataclass(frozen=True)
+class RefusedFile:
+    """What is known of a file that a denoising job would refuse: its headers, and the mapping where there is one."""
+
+    path: str
+    headers: tuple[Header, ...]
+    mapping: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return {"path": self.path, "parts": [header_as_dict(header) for header in self.headers], "refused": True}
+
+    def lines(self) -> list[str]:
+        """The same for a reader."""
+        roles = ["roles", *(f"  {line}" for line in self.mapping)] if self.mapping else []
+        return [self.path, *_header_lines(self.headers, None), *roles, "a denoising job would refuse it"]
+
+
+def refused_file(
+    path: str | os.PathLike[str], part: str | int | None = None, overrides: Mapping[str, str] | None = None
+) -> RefusedFile:
+    """What can be said of a file that `file_info` refuses. Raises InputError where not even its headers can be read."""
+    headers = read_headers(path)
+    mapping: list[str] = []
+    with suppress(LbmcError), DeepReader(path, part) as reader:
+        header = reader.header
+        mapping = map_roles(header.channel_names, overrides, attributes=header.attributes).lines()
+    return RefusedFile(os.fspath(path), tuple(headers), tuple(mapping))
 
 
 def file_info(
@@ -209,6 +236,19 @@ def decisions_as_dict(seen: Survey) -> dict[str, Any]:
         "cells": int(seen.cells.passed.size),
         "cells_passed": int(seen.cells.passed.sum()),
     }
+
+
+def _header_lines(headers: Sequence[Header], part: int | None) -> list[str]:
+    """All parts' headers; the part that is read is marked."""
+    text = []
+    for number, header in enumerate(headers):
+        mark = "*" if number == part else " "
+        text.append(f"{mark} part {number} {header.name!r}: {header.type}, {header.compression}")
+        text.append(f"    data window     {_window(header.data_window)}")
+        text.append(f"    display window  {_window(header.display_window)}, pixel aspect {header.pixel_aspect:g}")
+        text.append("    channels        " + " ".join(f"{c.name}:{c.dtype.name}" for c in header.channels))
+        text += [f"    {name:<15} {_short(stored.value)}" for name, stored in header.attributes.items()]
+    return text
 
 
 def header_as_dict(header: Header) -> dict[str, Any]:

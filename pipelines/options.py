@@ -100,8 +100,8 @@ class DenoiseOptions:
             raise ValueError(f"threads must be at least 1, not {self.threads}")
         if self.memory is not None and self.memory < 1:
             raise ValueError(f"memory must be positive, not {self.memory}")
-        if self.exposure is not None and not 0.0 < self.exposure < float("inf"):
-            raise ValueError(f"exposure must be positive and finite, not {self.exposure}")
+        if self.exposure is not None and not 1e-30 <= self.exposure <= 1e30:  # single precision holds its products
+            raise ValueError(f"exposure must be positive and finite, 1e-30 to 1e30, not {self.exposure}")
         if self.exposure is not None and self.exposure_from is not None:
             raise ValueError("exposure and exposure_from exclude each other")
         if self.compression not in COMPRESSIONS:

@@ -18,6 +18,7 @@ from deep_io.samples import Window
 from pipelines.cells import Cells, CellSurvey
 
 EXPOSURE_BIN = 16  # pixels along a bin's side
+DARKEST = 1e-30  # a radiance below is black: the inverse of a denormal number is no single-precision number
 STIRRING = 1 / 16  # beyond it a role says something; in pixels, motion and blur below it are less than a filter's width
 MIXED_DEPTH = 0.1  # of the depth: hits of a pixel that are closer together are one surface
 
@@ -112,7 +113,7 @@ class Surveyor:
 def exposure_of(radiance: npt.NDArray[np.float32]) -> float:
     """Exposure (1 / radiance) of a picture of mean radiance (H, W, 3): 2^-median(log2 of the positive bin means).
 
-    Bins are EXPOSURE_BIN pixels square, the last ones smaller; 1 if no bin is positive. Non-finite pixels count as 0.
+    Bins are EXPOSURE_BIN pixels square, the last ones smaller; 1 if all are black. Non-finite pixels count as 0.
     """
     luminance = radiance.mean(-1, dtype=np.float64)
     bins: dict[int, npt.NDArray[np.float64]] = {}
@@ -123,7 +124,7 @@ def exposure_of(radiance: npt.NDArray[np.float32]) -> float:
 
 def exposure_of_bins(means: npt.NDArray[np.float64]) -> float:
     """Exposure from the bins' mean radiance."""
-    positive = means[means > 0]
+    positive = means[means > DARKEST]
     return float(2.0 ** -np.median(np.log2(positive))) if positive.size else 1.0
 
 

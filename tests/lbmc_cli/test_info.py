@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from deep_io import DeepSamples, Window
-from tests.end_to_end.scenes import noisy_scene, write_scene
+from tests.end_to_end.scenes import changed, noisy_scene, write_scene
 from tests.runner import Runner, in_process
 
 SMALL = Window(2, 3, 17, 14)
@@ -74,3 +75,23 @@ def test_samples_without_depth_or_alpha_are_said_to_be(tmp_path: Path) -> None:
     run = in_process("info", write_scene(tmp_path / "bare.exr", bare))
     assert run.code == 0
     assert "depth      -- missing" in run.out
+
+
+def test_a_file_that_a_job_would_refuse_is_shown_before_it_is_refused(lbmc: Runner, tmp_path: Path) -> None:
+    samples = noisy_scene(0, SMALL)
+    fractional = changed(samples, A=np.full(samples.total, 0.5, np.float16))
+    run = lbmc("info", write_scene(tmp_path / "fractional.exr", fractional))
+    assert run.code == 3
+    for words in ("16 x 12, (2, 3) to (17, 14)", "albedo.B:float16", "normal     <- N.X N.Y N.Z", "would refuse"):
+        assert words in run.out
+    assert run.err.startswith("ERROR: ")
+    assert "--weighting uniform or over" in run.err
+
+    colourless = DeepSamples(samples.counts, {"Z": samples.channels["Z"]}, SMALL)
+    source = write_scene(tmp_path / "colourless.exr", colourless)
+    run = lbmc("info", source)
+    assert run.code == 3
+    assert "Z:float32" in run.out
+    assert "roles" not in run.out
+    assert "--map radiance=LAYER" in run.err
+    assert json.loads(lbmc("info", source, "--json").out)["parts"][0]["channels"] == {"Z": "float32"}

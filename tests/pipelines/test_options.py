@@ -19,6 +19,7 @@ from pipelines.options import DenoiseOptions
         {"exposure": 0.0},
         {"exposure": float("nan")},
         {"exposure": float("inf")},
+        {"exposure": 1e40},
         {"exposure": 1.0, "exposure_from": "1001"},
         {"compression": "zstd"},
     ],

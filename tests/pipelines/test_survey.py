@@ -79,6 +79,11 @@ def test_a_black_frame_has_exposure_one_and_a_frame_without_hits_depth_one() -> 
     assert (seen.exposure, seen.depth) == (1.0, 1.0)
 
 
+def test_a_frame_of_denormal_numbers_is_black_because_its_exposure_would_be_infinite() -> None:
+    assert exposure_of(np.full((5, 5, 3), 1e-40, np.float32)) == 1.0
+    assert np.isfinite(np.float32(exposure_of(np.full((5, 5, 3), 1e-29, np.float32))))
+
+
 def test_depth_mixes_where_surfaces_or_the_sky_share_a_pixel() -> None:
     depth = np.array([2.0, 2.1, 2.0, 3.0, 2.0, 0.0, 0.0, 0.0], np.float32)[:, None]  # two samples a pixel
     coverage = np.array([1, 1, 1, 1, 1, 0, 0, 0], np.float32)
