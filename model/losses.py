@@ -34,7 +34,7 @@ class LossWeights:
                "less, outliers cut: a hard crop counts no more than an easy one"
     ] = 0.2
     noise2noise: Annotated[
-        float, "squared error relative to the prediction, (d - y)^2 / (d^2 + 0.01), nothing cut: safe for noisy references"
+        float, "squared error relative to the prediction, (d - y)^2 / (d^2 + 0.01), uncut: safe for noisy references"
     ] = 0.0
     tone_mapped: Annotated[float, "squared error of the pictures as sRGB of log(1 + x)"] = 0.0
     pooled: Annotated[
