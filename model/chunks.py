@@ -24,8 +24,8 @@ Index = slice | Tensor
 class Chunk:
     """Some pixels of a batch of pictures.
 
-    samples : theirs, as one image row
-    pixels, own : which pixels and which samples of the whole they are, ranges or (n,) int64
+    samples : theirs, as one image row; by turns where pixels hold equally many
+    pixels, own : which pixels and which samples, in pixel order, of the whole they are, ranges or (n,) int64
     relative : their rows of what `Denoiser` knows of each sample's surroundings, None for nothing
     """
 
@@ -35,10 +35,15 @@ class Chunk:
     relative: Tensor | None
 
 
+def in_one_chunk(samples: Samples) -> bool:
+    """Whether `chunks` of all pixels is one; always where a gradient is wanted."""
+    return torch.is_grad_enabled() or samples.weight.numel() <= CHUNK_SAMPLES
+
+
 def chunks(samples: Samples, relative: Tensor | None, wanted: Tensor | None = None) -> Iterator[Chunk]:
     """The pixels, or the `wanted` (P,) ones, in chunks; one chunk in order when a gradient is wanted."""
     pixels, total = samples.counts.numel(), samples.weight.numel()
-    if torch.is_grad_enabled() or (wanted is None and total <= CHUNK_SAMPLES):
+    if torch.is_grad_enabled() or (wanted is None and in_one_chunk(samples)):
         yield Chunk(samples, slice(0, pixels), slice(0, total), relative)
         return
     counts = samples.counts.long()
@@ -57,8 +62,14 @@ def together(parts: Sequence[tuple[Index, Tensor]], total: int, absent: Tensor |
     """Rows by chunk -> (total, ...) all rows; those that no chunk holds are `absent` (...), or 0."""
     first = parts[0][1]
     if all(isinstance(rows, slice) for rows, _ in parts) and sum(len(part) for _, part in parts) == total:
-        return torch.cat([part for _, part in parts], 0) if len(parts) > 1 else first
+        if len(parts) == 1:
+            return first
+        if first.dim() == 3:
+            return torch.cat([part.movedim(0, -1) for _, part in parts], -1).movedim(-1, 0)
+        return torch.cat([part for _, part in parts], 0)
     whole = first.new_zeros(total, *first.shape[1:])
+    if first.dim() == 3:  # layers: stored column by column, as pictures are
+        whole = first.new_zeros(*first.shape[1:], total).movedim(-1, 0)
     if absent is not None:
         whole += absent
     for rows, part in parts:
@@ -84,10 +95,10 @@ def _chunk(samples: Samples, relative: Tensor | None, pixels: Tensor, counts: Te
     if last - first == len(pixels):
         start, stop = int(starts[first]), int(starts[last - 1] + counts[last - 1])
         own = slice(start, stop)
-        part = samples.pixel_range(first, last, start, stop)
-        return Chunk(part, slice(first, last), own, None if relative is None else relative[own])
+        part = samples.pixel_range(first, last, start, stop).by_turns()
+        return Chunk(part, slice(first, last), own, None if relative is None else part.like(relative[own]))
     held = counts[pixels]
     before = starts[pixels] - (held.cumsum(0) - held)  # what is between a pixel's samples here and there
     index = torch.repeat_interleave(before, held) + torch.arange(int(held.sum()), device=pixels.device)
-    part = samples.picked(pixels, index)
-    return Chunk(part, pixels, index, None if relative is None else relative[index])
+    part = samples.picked(pixels, index).by_turns()
+    return Chunk(part, pixels, index, None if relative is None else part.like(relative[index]))

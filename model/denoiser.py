@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model.chunks import Chunk, Index, chunks, together
+from model.chunks import Chunk, Index, chunks, in_one_chunk, together
 from model.compositing import Layers, composite, fill_holes, to_layers
 from model.config import Config
 from model.direct import filter_direct, make_generators, splat_samples
@@ -40,8 +40,8 @@ from model.partition import (
 )
 from model.reach import influence
 from model.reducer import LogFeatures, SampleReducer, context_inputs, pixel_rows
-from model.samples import Samples, Segments
-from model.targets import TARGET_CELL, cells_with, sources_of
+from model.samples import Samples, columns
+from model.targets import TARGET_CELL, box_of, cells_with, sources_of
 
 CONFIDENCE_START = -3.0  # softplus(-3) = 0.05: nearly unbiased at the start
 OUTLIER_RATE_START = -1.5  # softplus(-1.5) = 0.2: what each log unit beyond OUTLIER_START adds to gamma
@@ -132,6 +132,8 @@ class Denoiser(nn.Module):
         """
         config = self.config
         keep = kept_logits(layers or config.layers, config.partition_logits)
+        if in_one_chunk(samples) and config.variant != "sample_splat":
+            samples = samples.by_turns()
         relative = self._surroundings(samples, scale)
         contexts, embedding = self._context(samples, relative, scale)
         context = _rows(contexts[0], samples.shape)  # (P, C)
@@ -158,19 +160,19 @@ class Denoiser(nn.Module):
         for part in chunks(samples, relative):
             embedding = self.reducer(part.samples, scale)
             log_partition, _ = self._partition(part, embedding, context[part.pixels], scale, keep)
-            shares.append((part.own, log_partition.exp()))
+            shares.append((part.own, part.samples.in_pixel_order(log_partition.exp())))
         return together(shares, len(samples.weight))
 
     def _surroundings(self, samples: Samples, scale: FrameScale) -> Tensor | None:
         """(N, 1 or 2) each sample against its neighbourhood: depth (0: unknown), then radiance; None for neither."""
-        segments, columns = Segments(samples.counts), []
+        segments, found = samples.segments, []
         if self.config.depth_prior:
             known = "depth" in samples.roles
             unknown = torch.zeros_like(samples.weight[:, None])
-            columns.append(relative_depth(samples, segments, scale) if known else unknown)
+            found.append(relative_depth(samples, segments, scale) if known else unknown)
         if self.config.confidence:
-            columns.append(outlierness(samples, segments, scale))
-        return torch.cat(columns, 1) if columns else None
+            found.append(outlierness(samples, segments, scale))
+        return columns(found) if found else None
 
     # --- context ---------------------------------------------------------------------------------------------------
 
@@ -201,7 +203,7 @@ class Denoiser(nn.Module):
     def _splat(self, part: Chunk, embedding: Tensor, context: Tensor, scale: FrameScale, keep: list[int]) -> Tensor:
         """(P, L, K) rows: log n, log w, then per unit of occupancy basic values, guides if needed, embedding, extra."""
         samples = part.samples
-        segments = Segments(samples.counts)
+        segments = samples.segments
         log_weight = torch.log(samples.weight[:, None])
         log_partition = torch.zeros_like(log_weight)
         if self.config.layered:
@@ -213,21 +215,21 @@ class Denoiser(nn.Module):
         values += [embedding.to(values[0].dtype), *extra_values(samples)]
         if self.config.demodulation:
             values += demodulated_lights(samples)
-        result = splat(log_weight, log_partition, torch.cat(values, 1), segments)
-        return torch.cat([result.log_n[..., None], result.log_w[..., None], result.values], 2)
+        result = splat(log_weight, log_partition, columns(values), segments)
+        return columns([result.log_n[..., None], result.log_w[..., None], result.values])
 
     def _partition(self, part: Chunk, embedding: Tensor, context: Tensor, scale: FrameScale, keep: list[int]
                    ) -> tuple[Tensor, Tensor | float]:
         """(N, L) log of the partition, and what the confidence takes from the log of each weight, (N, 1)."""
         samples, relative = part.samples, part.relative
         config = self.config
-        mine = embedding if relative is None else torch.cat([embedding, relative.to(embedding.dtype)], 1)
-        shared = Segments(samples.counts).expand(self.partitioner.first(0, context))
+        mine = embedding if relative is None else columns([embedding, relative.to(embedding.dtype)])
+        shared = samples.segments.expand(self.partitioner.first(0, context))
         raw = self.partitioner.rest(shared + self.partitioner.first(1, mine)).to(samples.weight.dtype)
-        logits = raw[:, keep]
+        logits = columns([raw[:, layer : layer + 1] for layer in keep])
         if config.depth_prior and relative is not None:
             logits = logits + initial_logits(relative[:, :1], self.prior_strength, keep, config.partition_logits)
-        log_partition = torch.log_softmax(logits, 1)
+        log_partition = logits - torch.logsumexp(logits, 1, keepdim=True)  # faster than log_softmax on columns
         if not config.confidence:
             return log_partition, 0.0
         brightness = log_radiance(samples.roles["radiance"].amax(1, keepdim=True), scale.exposure)
@@ -242,21 +244,28 @@ class Denoiser(nn.Module):
                          scale: FrameScale, keep: list[int], wanted: Tensor | None) -> Tensor:
         """(B, L, 6 + E, H, W) visible planes."""
         planes, predictions = [], []
-        sources = active = None
+        sources, active, box = None, None, (slice(None), slice(None))
         if wanted is not None:
-            sources = sources_of(wanted, self.config.kernel_sizes).flatten()
-            active = cells_with(wanted, TARGET_CELL).repeat_interleave(len(keep), 0)
+            seen = sources_of(wanted, self.config.kernel_sizes)
+            sources, box = seen.flatten(), box_of(seen)
+            active = cells_with(wanted[:, *box], TARGET_CELL).repeat_interleave(len(keep), 0)
         for rows, part in self._splat_chunks(samples, embedding, relative, context, scale, keep, sources):
             end = GUIDED_COLUMNS + self.config.embedding
             predictions.append((rows, predict(self.generator, self.layer_bias[keep], part[..., :end], context[rows])))
             # the embedding has done its work
-            planes.append((rows, torch.cat([part[..., :GUIDED_COLUMNS], part[..., end:]], -1)))
+            planes.append((rows, columns([part[..., :GUIDED_COLUMNS], part[..., end:]])))
         empty = planes[0][1].new_zeros(planes[0][1].shape[-1])
         empty[:2] = -torch.inf  # log n, log w: where no kernel looks there may as well be nothing
         splats = _picture(together(planes, samples.counts.numel(), empty), samples.shape).flatten(0, 1)
         predicted = _picture(together(predictions, samples.counts.numel()), samples.shape).flatten(0, 1)
+        splats, predicted = splats[..., *box], predicted[..., *box]
         means = filter_guided(splats, predicted, self.guide_matrix, self.config, scale, samples.lights, active)
-        return composite(means.view(samples.shape[0], len(keep), *means.shape[1:]))
+        visible = composite(means.view(samples.shape[0], len(keep), *means.shape[1:]))
+        if visible.shape[-2:] == samples.shape[1:]:
+            return visible
+        whole = visible.new_zeros(*visible.shape[:3], *samples.shape[1:])
+        whole[..., *box] = visible
+        return whole
 
     def _filter_direct(self, samples: Samples, embedding: Tensor, relative: Tensor | None, contexts: list[Tensor],
                        context: Tensor, scale: FrameScale, keep: list[int]) -> Tensor:
@@ -272,7 +281,7 @@ class Denoiser(nn.Module):
             embedding = together(parts, len(samples.weight))
         generator = self.generators[0]
         assert isinstance(generator, Mlp)
-        values = torch.cat([basic_values(samples, scale), *extra_values(samples)], 1)
+        values = columns([basic_values(samples, scale), *extra_values(samples)])
         return splat_samples(samples, values, embedding, context, generator)
 
 

@@ -15,7 +15,7 @@ from model.config import DIVISOR_WINDOW, Config
 from model.features import FrameScale, divisor, log_depth, log_radiance
 from model.networks import Mlp
 from model.partition import BASIC_COLUMNS, FILTERED, hit_depth, share_of
-from model.samples import Samples
+from model.samples import Samples, columns
 
 GUIDE_SCALES = (2.0, 2.0, 2.0, 3.0, 1.5, 1.5, 1.5)  # normal, log depth, divisor: the joint bilateral filter at step 0
 # What a log unit of glare takes from a source's logit at each coarser level: a cell that holds a corner of a lamp is
@@ -40,7 +40,7 @@ def guide_values(samples: Samples, scale: FrameScale) -> Tensor:
     if "normal" in samples.roles:
         normal = torch.where(hit, samples.roles["normal"], normal)
     by = divisor(samples)
-    return torch.cat([radiance / by, normal, log_depth(depth, scale.depth), by], 1)
+    return columns([radiance / by, normal, log_depth(depth, scale.depth), by])
 
 
 def glare(radiance: Tensor, exposure: float) -> Tensor:
@@ -86,7 +86,7 @@ def predict(generator: Mlp, layer_bias: Tensor, planes: Tensor, context: Tensor)
     embedding = values / torch.where(share > 0, share, 1)
     weight = torch.exp(log_n)  # below 1 where confidence is low or layers in front took the weight
     shared = generator.first(0, context)[:, None]  # (P, 1, hidden)
-    mine = generator.first(1, torch.cat([embedding, share, weight], 2))
+    mine = generator.first(1, columns([embedding, share, weight]))
     return generator.rest(shared + mine + layer_bias).to(planes.dtype)
 
 
@@ -104,21 +104,22 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
     share = share_of(log_n, log_w)[:, None]
     own = torch.where(share > 0, share, 1)  # values per unit of the layer's own weight: divide by this
     features, bias, preference, gate, glare_gate, *divided = torch.split(predictions, list(generator_sizes(config)), 1)
-    beyond = glare(planes[:, RADIANCE] / own, scale.exposure) * (2 * torch.sigmoid(glare_gate))
+    beyond = glare(planes[:, RADIANCE] / own, scale.exposure) * (0.5 + torch.sigmoid(glare_gate))
     guides = planes[:, GUIDES] / own
     bias = bias - beyond * GLARE_PER_LEVEL * torch.arange(bias.shape[1], device=bias.device)[:, None, None]
     features = features + torch.einsum("bghw,fg->bfhw", guides, guide_matrix) * (2 * torch.sigmoid(gate))
     features = torch.cat([features, GLARE_SCALE * beyond], 1)
     reduced_too = [planes[:, REDUCED]] if config.demodulation else []
     values = torch.cat([planes[:, FILTERED], share, *reduced_too, planes[:, GUIDED_COLUMNS:]], 1)
-    out = affinity_filter(features, bias, preference, log_n, values, config.kernel_sizes)
+    out = affinity_filter(features, bias, preference, log_n, values, config.kernel_sizes, active)
     if not config.demodulation:
         return out
     plain, others, reduced, extra = torch.split(out, [3, 3, 3, out.shape[1] - 9], 1)
     mix, divisor_gate, divisor_bias = divided
     by = guides[:, 4:7]
     sharp = by * (DIVISOR_GUIDE_SCALE * torch.sigmoid(divisor_gate))
-    factor = affinity_filter(sharp, divisor_bias, torch.zeros_like(divisor_bias), log_w, by, (DIVISOR_WINDOW,))
+    no_preference = torch.zeros_like(divisor_bias)
+    factor = affinity_filter(sharp, divisor_bias, no_preference, log_w, by, (DIVISOR_WINDOW,), active)
     # no own weight near the target: nothing to multiply by, the plain path stands
     amount = torch.sigmoid(mix) * (factor.amax(1, keepdim=True) > 0)
     color = torch.lerp(plain, reduced * factor, amount)

@@ -34,6 +34,16 @@ def _xavier(module: nn.Linear | nn.Conv2d) -> None:
         nn.init.zeros_(module.bias)
 
 
+def linear_columns(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    """`F.linear` of tables (N, C) and of (N, L, C) stored column by column, in that order; of others as they are."""
+    if x.dim() == 2:
+        return (weight @ x.T if bias is None else torch.addmm(bias[:, None], weight, x.T)).T
+    if x.dim() > 3 or x.stride(0) != 1:
+        return F.linear(x, weight, bias)
+    layers = [linear_columns(layer, weight, bias).T for layer in x.unbind(1)]  # (outputs, N) each
+    return torch.stack(layers).permute(2, 0, 1)
+
+
 class Mlp(Products):
     """Rows (N, inputs) -> (N, widths[-1]).
 
@@ -60,15 +70,17 @@ class Mlp(Products):
     def first(self, group: int, x: Tensor) -> Tensor:
         """One group's part of the first layer: (N, groups[group]) -> (N, widths[0]), before the activation."""
         with self.products(x):
-            part: Tensor = self.groups[group](x)
-        return part
+            linear = self.groups[group]
+            assert isinstance(linear, nn.Linear)
+            return linear_columns(x, linear.weight, linear.bias)
 
     def rest(self, x: Tensor, activate_last: bool = False) -> Tensor:
-        """From the sum of the first layer's parts to the output."""
+        """From the sum of the first layer's parts, which is overwritten, to the output."""
         with self.products(x):
             for layer in self.layers:
-                x = layer(F.leaky_relu(x, LEAK))
-        return F.leaky_relu(x, LEAK) if activate_last else x
+                assert isinstance(layer, nn.Linear)
+                x = linear_columns(F.leaky_relu_(x, LEAK), layer.weight, layer.bias)
+        return F.leaky_relu_(x, LEAK) if activate_last else x
 
 
 class _Block(nn.Module):
@@ -84,7 +96,7 @@ class _Block(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         for convolution in self.convolutions:
-            x = F.leaky_relu(convolution(x), LEAK)
+            x = F.leaky_relu_(convolution(x), LEAK)
         return x
 
 

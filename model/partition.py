@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from model.features import FrameScale, log_depth, log_radiance
-from model.samples import Samples, Segments
+from model.samples import Samples, Segments, columns
 
 PRIOR_WINDOW = 9  # pixels; the neighbourhood that depth is compared with
 OUTLIER_WINDOWS = (3, 9)  # pixels; the neighbourhoods that a sample's radiance is compared with
@@ -52,17 +52,27 @@ def relative_depth(samples: Samples, segments: Segments, scale: FrameScale) -> T
     depth = torch.where(hit, samples.roles["depth"], scale.depth)
     zeta = log_depth(depth, scale.depth)
     weight = samples.weight[:, None] * hit
-    moments = segments.sum(torch.cat([weight, weight * zeta, weight * zeta * zeta], 1))  # (P, 3)
-    picture = moments.view(batch, height, width, 3).permute(0, 3, 1, 2)
-    blurred = F.avg_pool2d(picture, PRIOR_WINDOW, 1, PRIOR_WINDOW // 2)
-    total, first, second = torch.split(blurred.permute(0, 2, 3, 1).reshape(-1, 3), 1, 1)
+    moments = segments.sum(columns([weight, weight * zeta, weight * zeta * zeta]))  # (P, 3)
+    around = window_sums(moments.T.reshape(3, batch, height, width), PRIOR_WINDOW).view(3, -1, 1)
+    total, first, second = around
     some = total > 0
     safe = torch.where(some, total, 1)
     mean = first / safe
     spread = (second / safe - mean * mean).clamp_min(0).sqrt()
-    around = segments.expand(torch.cat([mean, spread, some.to(mean.dtype)], 1))
-    relative = ((zeta - around[:, :1]) / (around[:, 1:2] + PRIOR_SPREAD)).clamp(-PRIOR_LIMIT, PRIOR_LIMIT)
-    return torch.where(hit, relative * around[:, 2:], PRIOR_LIMIT)
+    scaled = some / (spread + PRIOR_SPREAD)  # where nothing is around, nothing is known
+    relative = (zeta - segments.expand(mean)) * segments.expand(scaled)
+    return torch.where(hit, relative.clamp(-PRIOR_LIMIT, PRIOR_LIMIT), PRIOR_LIMIT)
+
+
+def window_sums(picture: Tensor, window: int) -> Tensor:
+    """(..., H, W) -> (..., H, W): sums over window x window (odd) pixels around each pixel, along axis by axis."""
+    for axis in (-1, -2):
+        radius, length = window // 2, picture.shape[axis]
+        padded = F.pad(picture, (radius, radius) if axis == -1 else (0, 0, radius, radius))
+        picture = padded.narrow(axis, 0, length).clone()
+        for shift in range(1, window):
+            picture += padded.narrow(axis, shift, length)
+    return picture
 
 
 @dataclass
@@ -90,7 +100,7 @@ def hit_depth(samples: Samples, scale: FrameScale) -> tuple[Tensor, Tensor]:
 def basic_values(samples: Samples, scale: FrameScale) -> Tensor:
     """(N, 5) what every variant filters: radiance, coverage, coverage * depth."""
     coverage = samples.coverage[:, None]
-    return torch.cat([samples.roles["radiance"], coverage, coverage * hit_depth(samples, scale)[1]], 1)
+    return columns([samples.roles["radiance"], coverage, coverage * hit_depth(samples, scale)[1]])
 
 
 def extra_values(samples: Samples) -> list[Tensor]:
@@ -112,24 +122,30 @@ def splat(log_weight: Tensor, log_partition: Tensor, values: Tensor, segments: S
     log_partition : (N, L) log of the partition, rows sum to 1 in the linear domain
     values : (N, C) per sample
     """
-    behind = torch.logcumsumexp(log_partition.flip(1), 1).flip(1)  # (N, L): log sum_{k>=l} p_k
-    log_occupancy = log_weight + behind
+    log_occupancy = log_weight + log_sum_behind(log_partition)
     peak = segments.max(log_occupancy)  # (P, L)
     empty = peak == -torch.inf
     peak = torch.where(empty, 0, peak)
     at_samples = segments.expand(peak)
     occupancy = segments.sum(torch.exp(log_occupancy - at_samples))  # >= 1 unless empty
     own = torch.exp(log_weight + log_partition - at_samples)  # (N, L) <= 1
-    sums = segments.weighted_sum(own, torch.cat([values, torch.ones_like(log_weight)], 1))  # (P, L, C+1)
+    sums, weight = segments.weighted_sum(own, values), segments.sum(own)  # (P, L, C), (P, L)
     safe = torch.where(empty, 1, occupancy)
-    weight = sums[..., -1]
     tiny = torch.finfo(weight.dtype).tiny
     log_w = torch.where(weight > 0, torch.log(weight.clamp_min(tiny)) + peak, -torch.inf)
     return LayerSplat(
         log_n=torch.where(empty, -torch.inf, torch.log(safe) + peak),
         log_w=log_w,
-        values=sums[..., :-1] / safe[..., None],
+        values=sums / safe[..., None],
     )
+
+
+def log_sum_behind(log_partition: Tensor) -> Tensor:
+    """(N, L) -> (N, L): log sum_{k>=l} p_k."""
+    behind = [log_partition[:, -1:]]
+    for layer in reversed(range(log_partition.shape[1] - 1)):
+        behind.append(torch.logaddexp(log_partition[:, layer : layer + 1], behind[-1]))
+    return columns(behind[::-1])
 
 
 def outlierness(samples: Samples, segments: Segments, scale: FrameScale) -> Tensor:
@@ -146,15 +162,15 @@ def outlierness(samples: Samples, segments: Segments, scale: FrameScale) -> Tens
     brightness = log_radiance(radiance, scale.exposure)
     weight = samples.weight[:, None]
     exposed = (radiance * scale.exposure).clamp(0, RADIANCE_LIMIT)
-    sums = segments.sum(weight * torch.cat([torch.ones_like(weight), brightness, exposed], 1))  # (P, 3)
-    picture = sums.view(batch, height, width, 3).permute(0, 3, 1, 2)
-    around = OWN_SHARE * sums[:, 1]
+    sums = segments.sum(columns([weight, weight * brightness, weight * exposed]))  # (P, 3)
+    picture = sums.T.reshape(3, batch, height, width)
+    around = OWN_SHARE * sums[:, 1:2]
     for window in OUTLIER_WINDOWS:
-        blurred = F.avg_pool2d(picture, window, 1, window // 2).permute(0, 2, 3, 1).reshape(-1, 3)
-        means = blurred[:, 1:] / torch.where(blurred[:, :1] > 0, blurred[:, :1], 1)
-        around = torch.maximum(around, means[:, 0])
-    surroundings = segments.expand(torch.stack([around, torch.log1p(means[:, 1])], 1))  # the widest window's mean
-    above, rarity = (brightness - surroundings).split(1, 1)
+        total, bright, mean = window_sums(picture, window).view(3, -1, 1)
+        safe = torch.where(total > 0, total, 1)
+        around = torch.maximum(around, bright / safe)
+    above = brightness - segments.expand(around)
+    rarity = brightness - segments.expand(torch.log1p(mean / safe))  # against the mean of the widest window
     return torch.minimum(above, 2 * rarity - RARE)
 
 

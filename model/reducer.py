@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from model.config import Config
 from model.features import FrameScale, encode, feature_groups, held_groups, log_radiance
-from model.networks import Mlp
-from model.samples import Samples, Segments
+from model.networks import Mlp, linear_columns
+from model.samples import Samples, columns
 
 PIXEL_STATISTICS = 6  # log mean radiance (3), log spread of luminance, spread of relative depth, effective count
 LUMINANCE_LIMIT = 1e18  # its square must stay in the range of float32
@@ -35,14 +34,14 @@ class SampleReducer(nn.Module):
         features = encode(samples, scale, self.groups)
         there = {*features, *held_groups(samples)}
         present = [k for k, name in enumerate(self.groups) if name in there]
-        columns = [c for name in self.groups if name in features for c in range(*self.spans[name])]
+        inputs = [c for name in self.groups if name in features for c in range(*self.spans[name])]
         first = self.mlp.groups[0]
         assert isinstance(first, nn.Linear)
-        weight = first.weight if len(columns) == first.in_features else first.weight[:, columns]
+        weight = first.weight if len(inputs) == first.in_features else first.weight[:, inputs]
         bias = first.bias if self.presence is None else first.bias + self.presence[present].sum(0)
-        x = torch.cat([features[name] for name in self.groups if name in features], 1)
+        x = columns([features[name] for name in self.groups if name in features])
         with self.mlp.products(x):
-            hidden = F.linear(x, weight, bias)
+            hidden = linear_columns(x, weight, bias)
         return self.mlp.rest(hidden, activate_last=True)
 
 
@@ -57,7 +56,7 @@ class LogFeatures(nn.Module):
         features = encode(samples, scale, self.groups)
         radiance = samples.roles["radiance"]
         absent = {name: radiance.new_zeros(len(radiance), width) for name, width in self.groups.items()}
-        return torch.cat([features.get(name, absent[name]) for name in self.groups], 1)
+        return columns([features.get(name, absent[name]) for name in self.groups])
 
 
 def context_inputs(config: Config) -> int:
@@ -74,19 +73,19 @@ def pixel_rows(
     The weighted mean of the embeddings (N, E). Without a reducer also their population variance. With
     `config.statistics` also that, and PIXEL_STATISTICS numbers; `relative` begins with depth against the surroundings.
     """
-    segments = Segments(samples.counts)
+    segments = samples.segments
     weight = samples.weight[:, None]
     embedding = embedding.to(weight.dtype)
     if not config.statistics:
         mean = segments.weighted_sum(weight, embedding)[:, 0]
         if config.reducer:
-            return mean
+            return mean.contiguous()
         deviation = embedding - segments.expand(mean)
-        return torch.cat([mean, segments.weighted_sum(weight, deviation * deviation)[:, 0]], 1)
+        return columns([mean, segments.weighted_sum(weight, deviation * deviation)[:, 0]]).contiguous()
     radiance = samples.roles["radiance"]
     luminance = radiance.mean(1, keepdim=True).clamp(-LUMINANCE_LIMIT, LUMINANCE_LIMIT)
     offset = torch.zeros_like(luminance) if relative is None or not config.depth_prior else relative[:, :1]
-    moments = torch.cat([embedding, radiance, luminance, offset], 1)
+    moments = columns([embedding, radiance, luminance, offset])
     mean = segments.weighted_sum(weight, moments)[:, 0]
     deviation = moments - segments.expand(mean)
     variance = segments.weighted_sum(weight, deviation * deviation)[:, 0]
@@ -94,7 +93,7 @@ def pixel_rows(
     concentration = segments.sum(squares)
     count = torch.log2(torch.where(concentration > 0, concentration, 1)) * -0.25
     e = embedding.shape[1]
-    return torch.cat(
+    return columns(
         [
             mean[:, :e],
             variance[:, :e],
@@ -102,6 +101,5 @@ def pixel_rows(
             torch.log1p(variance[:, e + 3 : e + 4].sqrt() * scale.exposure),
             variance[:, e + 4 :].sqrt(),
             count,
-        ],
-        1,
-    )
+        ]
+    ).contiguous()

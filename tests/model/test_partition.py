@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+import torch.nn.functional as F
 
 from model.features import FrameScale
 from model.partition import (
@@ -13,9 +14,11 @@ from model.partition import (
     initial_logits,
     kept_logits,
     layer_positions,
+    log_sum_behind,
     mixture,
     relative_depth,
     splat,
+    window_sums,
 )
 from model.samples import Segments
 from tests.model.random_models import random_counts, random_samples, with_roles
@@ -112,3 +115,16 @@ def test_the_sky_is_behind_also_where_nothing_was_hit() -> None:
     samples = random_samples(3, (1, 3, 3), 2)
     samples.coverage[:] = 0
     assert bool((relative_depth(samples, Segments(samples.counts), FrameScale()) == PRIOR_LIMIT).all())
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (2, 12), (11, 7)])
+def test_window_sums_are_those_of_a_pooling_window(height: int, width: int) -> None:
+    picture = torch.rand(2, 3, height, width, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+    expected = F.avg_pool2d(picture, 9, 1, 4) * 81
+    torch.testing.assert_close(window_sums(picture, 9), expected)
+
+
+def test_logs_of_sums_behind_each_layer() -> None:
+    partition = torch.softmax(torch.randn(6, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64), 1)
+    expected = partition.flip(1).cumsum(1).flip(1)
+    torch.testing.assert_close(log_sum_behind(partition.log()).exp(), expected)

@@ -36,6 +36,31 @@ def test_reductions_equal_a_loop_over_pixels(counts: list[int]) -> None:
     torch.testing.assert_close(segments.expand(numbered), numbered.repeat_interleave(torch.tensor(counts), 0))
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_reductions_by_turns_equal_those_in_pixel_order(count: int) -> None:
+    draw = torch.Generator().manual_seed(count)
+    counts = torch.full((5,), count)
+    values, weight = (torch.randn(5 * count, width, generator=draw, dtype=torch.float64) for width in (3, 2))
+    given = Samples((1, 1, 5), counts, weight[:, 0], weight[:, 1], {"radiance": values}, extra=weight)
+    turned = given.by_turns()
+    assert turned.turns
+    torch.testing.assert_close(turned.in_pixel_order(turned.like(values)), values, rtol=0, atol=0)
+    for mine, theirs in ((turned.weight, given.weight), (turned.coverage, given.coverage)):
+        torch.testing.assert_close(turned.in_pixel_order(mine[:, None])[:, 0], theirs, rtol=0, atol=0)
+    mine, theirs, radiance = turned.segments, given.segments, turned.roles["radiance"]
+    assert turned.extra is not None
+    torch.testing.assert_close(mine.sum(radiance), theirs.sum(values))
+    torch.testing.assert_close(mine.max(radiance), theirs.max(values))
+    torch.testing.assert_close(mine.weighted_sum(turned.extra, radiance), theirs.weighted_sum(weight, values))
+    per_pixel = torch.randn(5, 4, generator=draw)
+    torch.testing.assert_close(mine.expand(per_pixel), turned.like(theirs.expand(per_pixel)))
+
+
+def test_samples_of_uneven_pixels_stay_in_pixel_order() -> None:
+    uneven = samples()
+    assert uneven.by_turns() is uneven
+
+
 def samples(**changes: Any) -> Samples:
     fields: dict[str, Any] = {
         "shape": (1, 1, 2), "counts": torch.tensor([1, 2]), "weight": torch.tensor([1.0, 0.5, 0.5]),
