@@ -225,8 +225,8 @@ class Denoiser(nn.Module):
         config = self.config
         mine = embedding if relative is None else columns([embedding, relative.to(embedding.dtype)])
         shared = samples.segments.expand(self.partitioner.first(0, context))
-        raw = self.partitioner.rest(shared + self.partitioner.first(1, mine)).to(samples.weight.dtype)
-        logits = columns([raw[:, layer : layer + 1] for layer in keep])
+        raw = self.partitioner.rest(shared + self.partitioner.first(1, mine)).to(samples.weight.dtype).split(1, 1)
+        logits = columns([raw[layer] for layer in keep])
         if config.depth_prior and relative is not None:
             logits = logits + initial_logits(relative[:, :1], self.prior_strength, keep, config.partition_logits)
         log_partition = logits - torch.logsumexp(logits, 1, keepdim=True)  # faster than log_softmax on columns
@@ -235,7 +235,7 @@ class Denoiser(nn.Module):
         brightness = log_radiance(samples.roles["radiance"].amax(1, keepdim=True), scale.exposure)
         assert relative is not None
         beyond = (relative[:, -1:] - OUTLIER_START).clamp_min(0)
-        gamma = F.softplus(raw[:, -1:]) + F.softplus(self.outlier_rate) * beyond
+        gamma = F.softplus(raw[-1]) + F.softplus(self.outlier_rate) * beyond
         return log_partition, gamma * brightness
 
     # --- kernels, filter, compositing ------------------------------------------------------------------------------

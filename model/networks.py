@@ -44,6 +44,11 @@ def linear_columns(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
     return torch.stack(layers).permute(2, 0, 1)
 
 
+def _activate(table: Tensor) -> Tensor:
+    """Leaky ReLU, in place without a gradient: with one, a transposed view that is overwritten is copied twice."""
+    return F.leaky_relu(table, LEAK, inplace=not torch.is_grad_enabled())
+
+
 class Mlp(Products):
     """Rows (N, inputs) -> (N, widths[-1]).
 
@@ -75,12 +80,12 @@ class Mlp(Products):
             return linear_columns(x, linear.weight, linear.bias)
 
     def rest(self, x: Tensor, activate_last: bool = False) -> Tensor:
-        """From the sum of the first layer's parts, which is overwritten, to the output."""
+        """From the sum of the first layer's parts, which may be overwritten, to the output."""
         with self.products(x):
             for layer in self.layers:
                 assert isinstance(layer, nn.Linear)
-                x = linear_columns(F.leaky_relu_(x, LEAK), layer.weight, layer.bias)
-        return F.leaky_relu_(x, LEAK) if activate_last else x
+                x = linear_columns(_activate(x), layer.weight, layer.bias)
+        return _activate(x) if activate_last else x
 
 
 class _Block(nn.Module):

@@ -142,9 +142,10 @@ def splat(log_weight: Tensor, log_partition: Tensor, values: Tensor, segments: S
 
 def log_sum_behind(log_partition: Tensor) -> Tensor:
     """(N, L) -> (N, L): log sum_{k>=l} p_k."""
-    behind = [log_partition[:, -1:]]
-    for layer in reversed(range(log_partition.shape[1] - 1)):
-        behind.append(torch.logaddexp(log_partition[:, layer : layer + 1], behind[-1]))
+    *others, last = log_partition.split(1, 1)
+    behind = [last]
+    for layer in reversed(others):
+        behind.append(torch.logaddexp(layer, behind[-1]))
     return columns(behind[::-1])
 
 

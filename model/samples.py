@@ -9,8 +9,9 @@ is several times faster than rows of a few numbers.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -98,6 +99,28 @@ class Segments:
         return out.scatter_reduce(0, index, values, "amax")
 
 
+class _WeightedSum(torch.autograd.Function):
+    """weight (L, turns, P), values (C, turns, P) -> (L, C, P), with a derivative that takes a column at a time.
+
+    Of all columns at once, the products would be written and read again for every layer: 3 times slower in training.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, weight: Tensor, values: Tensor) -> Tensor:
+        ctx.save_for_backward(weight, values)
+        return torch.stack([(values * layer).sum(1) for layer in weight])
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:
+        weight, values = ctx.saved_tensors
+        to_weight, to_values = torch.zeros_like(weight), torch.zeros_like(values)
+        for column, value in enumerate(values):
+            for layer, own in enumerate(weight):
+                to_weight[layer].addcmul_(value, grad[layer, column])
+                to_values[column].addcmul_(own, grad[layer, column])
+        return to_weight, to_values
+
+
 class Turns(Segments):
     """`Segments` of samples by turns: every pixel has the same number, at least one; see `Samples.by_turns`."""
 
@@ -116,9 +139,8 @@ class Turns(Segments):
 
     def weighted_sum(self, weight: Tensor, per_sample: Tensor) -> Tensor:
         """weight (N, L), per_sample (N, C) -> (P, L, C)."""
-        values = self._apart(per_sample)
-        sums = [(values * layer).sum(1) for layer in self._apart(weight)]  # (C, P) each
-        return torch.stack(sums).permute(2, 0, 1)
+        apply: Callable[..., Tensor] = _WeightedSum.apply
+        return apply(self._apart(weight), self._apart(per_sample)).permute(2, 0, 1)
 
     def max(self, per_sample: Tensor) -> Tensor:
         """(N, C) -> (P, C). Not differentiated."""

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from model.samples import Samples, Segments
+from model.samples import Samples, Segments, Turns
 
 
 def pieces(counts: list[int], values: Tensor) -> list[Tensor]:
@@ -54,6 +54,13 @@ def test_reductions_by_turns_equal_those_in_pixel_order(count: int) -> None:
     torch.testing.assert_close(mine.weighted_sum(turned.extra, radiance), theirs.weighted_sum(weight, values))
     per_pixel = torch.randn(5, 4, generator=draw)
     torch.testing.assert_close(mine.expand(per_pixel), turned.like(theirs.expand(per_pixel)))
+
+
+def test_derivative_of_weighted_sums_by_turns() -> None:
+    draw = torch.Generator().manual_seed(3)
+    weight, values = (torch.randn(6, width, generator=draw, dtype=torch.float64).requires_grad_() for width in (2, 3))
+    turns = Turns(torch.full((3,), 2))
+    assert torch.autograd.gradcheck(turns.weighted_sum, (weight, values))
 
 
 def test_samples_of_uneven_pixels_stay_in_pixel_order() -> None:
