@@ -5,8 +5,10 @@
 
 Depth mixes within a pixel where its samples' depths, sorted, have a gap of more than a tenth, a miss being infinitely
 far. Over those pixels of each scene, with two layers: the front layer's mean visible weight; the share of pixels in
-which that weight is between 10 and 90 %; the share in which the front layer's mean depth is in front of the back's.
-The first and the last are stated after the filter, and before it (each pixel's own samples, partitioned).
+which that weight is between 10 and 90 %; the share in which the front layer is nearer than the back, by the mean depth
+of their hits, and by the mean of 1 / depth, in which misses take part as 0. All are stated after the filter, and before
+it (each pixel's own samples, partitioned). A scene is blurred where 5 % of its samples move, or have a circle of
+confusion, of half a pixel or more, by the description beside it; else by its name.
 """
 
 from __future__ import annotations
@@ -38,6 +40,7 @@ ROWS = HOME / "docs" / "results" / "layers_alive.json"
 GAP = 1.1
 """Neighbours in depth within a pixel that differ by more than this factor are two surfaces."""
 LOW, HIGH = 0.1, 0.9
+VISIBLE = 0.5  # pixels of motion or circle of confusion
 BLUR = re.compile("defocus|motion")
 """In the name of a scene that has no description beside it."""
 Row = dict[str, Any]
@@ -56,12 +59,14 @@ def mixed_pixels(samples: PathSamples) -> NDArray[np.bool_]:
     return (np.bincount(pixel[order[:-1]][gaps], minlength=samples.counts.size) > 0).reshape(samples.counts.shape)
 
 
-def means(mixed: NDArray[np.bool_], front: Plane, nearer: NDArray[np.bool_]) -> Row:
-    """Means over the pixels where depth mixes: `front` visible weight of the front layer, `nearer` it is in front."""
-    weight = front[mixed]
-    return {"front": round(float(weight.mean()), 4),
-            "both": round(float(((weight >= LOW) & (weight <= HIGH)).mean()), 4),
-            "nearer": round(float(nearer[mixed].mean()), 4)}
+def means(mixed: NDArray[np.bool_], weight: Plane, coverage: Plane, depth: Plane, inverse: Plane) -> Row:
+    """Over the pixels where depth mixes. Of two layers (2, H, W): weight, coverage, depth of hits, mean 1 / depth."""
+    front = weight[0][mixed]
+    by_hits = np.where(coverage > 0, depth, np.inf)
+    return {"front": round(float(front.mean()), 4),
+            "both": round(float(((front >= LOW) & (front <= HIGH)).mean()), 4),
+            "nearer": round(float((by_hits[0] < by_hits[1])[mixed].mean()), 4),
+            "nearer_with_misses": round(float((inverse[0] > inverse[1])[mixed].mean()), 4)}
 
 
 @torch.inference_mode()
@@ -77,21 +82,22 @@ def measure(net: Denoiser, source: Path) -> Row:
     scale = FrameScale(seen.exposure, seen.depth)
     samples = to_model(block, net.config.roles, seen.depth, torch.device("cpu"))
     layers = net(samples, scale, 2)
-    depth = layers.depth[0].numpy()
-    row["filtered"] = means(mixed, layers.weight[0, 0].numpy(), depth[0] < depth[1])
-    # the same of the samples themselves: weights, and mean depths of hits, before any kernel
-    share = net.partition(samples, scale, 2).numpy() * block.weight[:, None]  # (N, 2)
-    hits = share * (block.coverage > 0)[:, None]
-    z = np.where(block.coverage > 0, block.roles["depth"][:, 0], 0.0)
-    pixel = np.repeat(np.arange(block.counts.size), block.counts.ravel())
-
-    def total(values: Plane) -> Plane:
-        return np.bincount(pixel, values, block.counts.size).reshape(block.counts.shape)
-
+    planes = (layers.weight, layers.coverage, layers.depth)
+    weight, coverage, depth = (plane[0].numpy().astype("f8") for plane in planes)
     with np.errstate(divide="ignore", invalid="ignore"):
-        front, back = (np.where(total(hits[:, k]) > 0, total(hits[:, k] * z) / total(hits[:, k]), np.inf)
-                       for k in range(2))
-    row["samples"] = means(mixed, total(share[:, 0]), front < back)
+        inverse = np.where((weight > 0) & (coverage > 0), coverage / weight / depth, 0.0)
+        row["filtered"] = means(mixed, weight, coverage, depth, inverse)
+        # the same of the samples themselves, before any kernel
+        share = net.partition(samples, scale, 2).numpy().T * block.weight  # (2, N)
+        hits = share * (block.coverage > 0)
+        z = np.where(block.coverage > 0, block.roles["depth"][:, 0], 1.0)
+        pixel = np.repeat(np.arange(block.counts.size), block.counts.ravel())
+
+        def totals(values: Plane) -> Plane:
+            return np.stack([np.bincount(pixel, one, block.counts.size).reshape(block.counts.shape) for one in values])
+
+        weight, coverage = totals(share), totals(hits)
+        row["samples"] = means(mixed, weight, coverage, totals(hits * z) / coverage, totals(hits / z) / weight)
     return row
 
 
@@ -101,7 +107,7 @@ def blurred(source: Path) -> bool:
     if not description.exists():
         return bool(BLUR.search(source.name))
     found = json.loads(description.read_text("utf-8"))
-    return any(found.get(key) for key in ("defocus", "camera_motion", "object_motion"))
+    return any(found.get(key, 0.0) >= VISIBLE for key in ("coc_95", "motion_95"))
 
 
 def measured(net: Denoiser, sets: dict[str, Path]) -> Iterator[tuple[str, str, Row]]:
@@ -126,7 +132,8 @@ def main() -> None:
     for name, scene, row in measured(weights.load(), sets):
         document["sets"].setdefault(name, {})[scene] = row
         print(f"{name} {scene}: depth mixes in {row['mixed']:.1%}" + "".join(
-            f"; {key}: front {row[key]['front']:.2f}, both {row[key]['both']:.1%}, nearer {row[key]['nearer']:.1%}"
+            f"; {key}: front {row[key]['front']:.2f}, both {row[key]['both']:.1%}, nearer {row[key]['nearer']:.1%}, "
+            f"with misses {row[key]['nearer_with_misses']:.1%}"
             for key in ("samples", "filtered") if key in row), flush=True)
     options.json.parent.mkdir(parents=True, exist_ok=True)
     options.json.write_text(json.dumps(document, indent=1) + "\n", "utf-8")

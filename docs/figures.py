@@ -63,7 +63,7 @@ def speed(results: Results) -> Figure:
     axes.set_xlim(right=max(x for x, _ in points.values()) * 2.5)
     count = len(results.scenes_of(samples))
     axes.set_title(f"Time against error: {count} scenes, {samples} samples per pixel", fontsize=11, loc="left")
-    axes.legend(frameon=False, fontsize=9, loc="upper right")
+    axes.legend(frameon=False, fontsize=9, loc="center right")
     return figure
 
 

@@ -5,7 +5,8 @@
 
 layers.png: an example scene through a preset: samples by layer, filtered layers, their composite, the reference.
 visibility.png: a scene with no noise but visibility, through two networks that benchmarks/paper.py trained in WORK
-(left out without it): one composites its layers by alpha, the other averages them. Needs the extra `bench`.
+(left out without it), one of which composites its layers by alpha and one averages them, and through the preset. Needs
+the extra `bench`.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ SCENE = HOME / "examples" / "scenes" / "defocus-motion"
 SIZE, SAMPLES = (160, 200), 8
 REFERENCE_PASSES, PASS_SAMPLES = 32, 32
 SEED = 4
-ALPHA, WEIGHTED = "LAYER.1.safetensors", "LAYER_w.1.safetensors"
+REDUCED = {"LAYER, reduced": "LAYER.1.safetensors", "LAYER_w, reduced": "LAYER_w.1.safetensors"}
 Picture = NDArray[np.floating]
 
 
@@ -121,7 +122,7 @@ def to_samples(traced: Traced) -> Samples:
 
 
 @torch.inference_mode()
-def draw_visibility(work: Path) -> None:
+def draw_visibility(work: Path, model: str | None) -> None:
     """visibility.png."""
     traced = trace(*SIZE, SAMPLES, SEED)
     passes = (trace(*SIZE, PASS_SAMPLES, SEED + 1 + k).mean() for k in range(REFERENCE_PASSES))
@@ -129,11 +130,14 @@ def draw_visibility(work: Path) -> None:
     samples, noisy = to_samples(traced), traced.mean()
     scale = FrameScale(exposure_of(noisy.astype("f4")), float(np.median(traced.roles["depth"])))
     k = common_scale(reference)
-    figure, axes = plt.subplots(2, 5, figsize=(13.6, 4.9), dpi=110)
-    show(axes[0, 0], noisy, f"noisy, {SAMPLES} samples, relMSE {error(noisy, reference):.3f}", k)
+    shipped = find_weights(model)
+    networks = {word: find_weights(str(work / name)) for word, name in REDUCED.items()} | {shipped.name: shipped}
+    figure, axes = plt.subplots(len(networks), 5, figsize=(13.6, 7.2), dpi=100)
+    show(axes[0, 0], noisy, f"noisy, {SAMPLES} samples, relMSE {error(noisy, reference):.4f}", k)
     show(axes[1, 0], reference, "reference", k)
-    for row, (word, name) in enumerate((("alpha", ALPHA), ("weighted", WEIGHTED))):
-        layers = find_weights(str(work / name)).load()(samples, scale, 2)
+    axes[2, 0].axis("off")
+    for row, (word, weights) in enumerate(networks.items()):
+        layers = weights.load()(samples, scale, 2)
         front, back = planes(layers.color)
         show(axes[row, 1], front, f"{word}: front layer", k)
         show(axes[row, 2], back, f"{word}: back layer", k)
@@ -151,7 +155,7 @@ def main() -> None:
     torch.set_num_threads(1)
     draw_layers(options.model)
     if options.work:
-        draw_visibility(options.work)
+        draw_visibility(options.work, options.model)
 
 
 if __name__ == "__main__":

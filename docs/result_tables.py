@@ -7,13 +7,15 @@ docs/results/paper.json is benchmarks/paper.py's, docs/results/layers_alive.json
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from model.config import LAYER
+from model.cost import count
 from model.metrics import geometric_mean
 from pipelines.bench.charts import number
 from pipelines.bench.results import Results, own, pareto
@@ -26,6 +28,8 @@ PUBLISHED_LAYERS = {2: 0.0288, 3: 0.0315, 4: 0.0313, 5: 0.0332}
 """relMSE of LAYER with so many layers as published; the paper's figure for one layer is not at hand."""
 SETS = {"val2": "14 of our own", "shared": "12 further"}
 """Sets of scenes in the JSON, and what the tables call them."""
+LEAST = 0.1
+"""The front layer is to have this share of the weight at least, and at most one less it."""
 BLURRED, STILL = "defocus or motion", "neither"
 Row = dict[str, Any]
 
@@ -62,6 +66,23 @@ def bench() -> str:
         rows.append([spec.name + (" ★" if spec.name in front else ""), *error, *time])
     head = ("method", "relMSE", "SMAPE", "CPU s at 1080p", "wall s", "CPU time of OIDN's")
     return markdown(head, rows)
+
+
+def scenes() -> str:
+    """relMSE / SMAPE / PSNR / energy of every scored method on every scene."""
+    results = Results.from_dict(load(BENCH))
+    names = [spec.name for spec in results.methods if spec.scored and spec.family != "saving"]
+    scores = {(row.scene, row.method): row.scores for row in results.measurements if row.scores}
+    rows = []
+    for name in names:
+        cells = []
+        for scene in results.scenes:
+            found = scores[scene.name, name]
+            values = [(found[key] or 0.0, digits) for key, digits in
+                      (("relmse", 4), ("smape", 4), ("psnr", 2), ("energy", 3))]
+            cells.append(" / ".join(f"{value:.{digits}f}" for value, digits in values))
+        rows.append([name, *cells])
+    return markdown(("relMSE / SMAPE / PSNR / energy", *(scene.name for scene in results.scenes)), rows)
 
 
 def stages() -> str:
@@ -107,20 +128,35 @@ def samples() -> str:
     return markdown(("relMSE with samples per pixel:", *map(str, counts)), rows)
 
 
+def layer_cost() -> str:
+    """The multiply-adds of the paper's LAYER, stage by stage."""
+    rows = []
+    for stage in count(LAYER).stages:
+        parts = [stage.pixel, stage.sample, stage.layer, stage.sample_layer]
+        total = stage.pixel + 8 * stage.sample + 2 * (stage.layer + 8 * stage.sample_layer)
+        rows.append([stage.name, f"{stage.parameters:,}" if stage.parameters else "–",
+                     *(f"{value:,.0f}" if value else "–" for value in parts), f"{total:,.0f}"])
+    whole = sum(count(LAYER).multiply_adds(8, 2).values())
+    rows.append(["**all**", f"{count(LAYER).parameters:,}", "", "", "", "", f"{whole:,.0f}"])
+    return markdown(("LAYER", "parameters", "per pixel", "per sample", "per layer", "per sample and layer",
+                     "8 samples, 2 layers"), rows)
+
+
 # --- the paper's comparisons ---------------------------------------------------------------------------------------
 
 
-def mean_errors(row: Row, name: str) -> tuple[float, float]:
-    """Geometric mean of relMSE and mean SMAPE over a set of scenes."""
+def mean_errors(row: Row, name: str) -> list[float]:
+    """Over a set of scenes: geometric means of relMSE, plain and without its worst 0.1 % of pixels; mean SMAPE."""
     scenes = row["scenes"][name].values()
-    return geometric_mean([scene["relmse"] for scene in scenes]), float(np.mean([scene["smape"] for scene in scenes]))
+    return [*(geometric_mean([scene[key] for scene in scenes]) for key in ("relmse", "trimmed")),
+            float(np.mean([scene["smape"] for scene in scenes]))]
 
 
 def errors_of(row: Row) -> list[str]:
     return [f"{value:.4f}" for name in SETS for value in mean_errors(row, name)]
 
 
-ERRORS = tuple(f"{word}, {scenes}" for scenes in SETS.values() for word in ("relMSE", "SMAPE"))
+ERRORS = tuple(f"{word}, {scenes}" for scenes in SETS.values() for word in ("relMSE", "trimmed", "SMAPE"))
 
 
 def paper_rows(names: Sequence[str]) -> list[Row]:
@@ -163,49 +199,59 @@ def blurred_scenes() -> dict[tuple[str, str], bool]:
 
 def pairs() -> str:
     """`fast` against others at equal steps, data and seed: ratios of relMSE, seed by seed."""
-    rows = [row for row in load(PAPER)["rows"].values() if row["group"] == "ours"]
-    by_key = {(row["name"], row["seed"]): row for row in rows}
+    rows = {(row["name"], row["seed"]): row for row in load(PAPER)["rows"].values() if row["group"] == "ours"}
+    others = [name for name in dict.fromkeys(name for name, _ in rows) if name != "fast"]
+    seeds = sorted(seed for name, seed in rows if name == "fast")
     blurred = blurred_scenes()
     lines = []
-    for other in dict.fromkeys(row["name"] for row in rows if row["name"] != "fast"):
-        for name, label in SETS.items():
-            for is_blurred, word in ((True, BLURRED), (False, STILL)):
-                ratios = {}
-                for seed in sorted({row["seed"] for row in rows}):
-                    if ("fast", seed) not in by_key or (other, seed) not in by_key:
-                        continue
-                    mine, theirs = (by_key[key, seed]["scenes"][name] for key in ("fast", other))
-                    logs = [math.log(mine[scene]["relmse"] / theirs[scene]["relmse"]) for scene in mine
-                            if blurred[name, scene] == is_blurred]
-                    ratios[seed] = math.exp(float(np.mean(logs)))
-                    count = len(logs)
-                if ratios:
-                    lines.append([f"against {other}: {word}, {count} of {label}",
-                                  *(f"{ratio:.3f}" for ratio in ratios.values()),
-                                  f"{geometric_mean(list(ratios.values())):.3f}"])
-    seeds = sorted({row["seed"] for row in rows})
-    return markdown(("relMSE of `fast`, as a share of the other's", *(f"seed {seed}" for seed in seeds), "mean"),
-                    [line for line in lines if len(line) == 2 + len(seeds)])
+    for other, name, is_blurred in product(others, SETS, (True, False)):
+        scenes = [scene for (group, scene), value in blurred.items() if group == name and value == is_blurred]
+        ratios = {seed: geometric_mean([rows["fast", seed]["scenes"][name][scene]["relmse"]
+                                        / rows[other, seed]["scenes"][name][scene]["relmse"] for scene in scenes])
+                  for seed in seeds if (other, seed) in rows}
+        lines.append([f"{other}; {len(scenes)} of {SETS[name]}, {BLURRED if is_blurred else STILL}",
+                      *(f"{ratios[seed]:.3f}" if seed in ratios else "–" for seed in seeds),
+                      f"{geometric_mean(list(ratios.values())):.3f}"])
+    return markdown(("relMSE of `fast` over that of", *(f"seed {seed}" for seed in seeds), "mean"), lines)
 
 
 def alive() -> str:
     """What the layers of the shipped network do where depth mixes within a pixel."""
+
+    def nearer(found: Row) -> str:
+        return f"{100 * found['nearer']:.0f} / {100 * found['nearer_with_misses']:.0f} %"
+
     lines = []
     for name, scenes in load(ALIVE)["sets"].items():
         for scene, row in sorted(scenes.items(), key=lambda item: not item[1]["blurred"]):
-            if "filtered" not in row:
-                continue
-            found = row["filtered"]
-            lines.append([f"{scene} ({BLURRED if row['blurred'] else STILL})", SETS.get(name, name).split()[0],
-                          f"{row['mixed']:.1%}", f"{found['front']:.2f}", f"{found['both']:.1%}",
-                          f"{row['samples']['nearer']:.1%}", f"{found['nearer']:.1%}"])
-    return markdown(("scene", "of the", "depth mixes in", "front layer's weight there", "10 to 90 % in",
+            if "filtered" in row:
+                found = row["filtered"]
+                lines.append([f"{scene} ({BLURRED if row['blurred'] else STILL})", SETS.get(name, name).split()[0],
+                              f"{row['mixed']:.0%}", f"{found['front']:.2f}", f"{found['both']:.0%}",
+                              nearer(row["samples"]), nearer(found)])
+    return markdown(("scene", "set of", "depth mixes in", "front layer's weight there", "10 to 90 % in",
                      "front is nearer, samples", "front is nearer, filtered"), lines)
+
+
+def alive_count() -> str:
+    """On how many scenes the layers of the shipped network are what was asked for."""
+    lines = []
+    for (name, scenes), is_blurred in product(load(ALIVE)["sets"].items(), (True, False)):
+        rows = [row["filtered"] for row in scenes.values() if row["blurred"] == is_blurred and "filtered" in row]
+        if rows:
+            lines.append([f"{len(rows)} of {SETS.get(name, name)}, {BLURRED if is_blurred else STILL}",
+                          str(sum(LEAST <= row["front"] <= 1 - LEAST for row in rows)),
+                          *(str(sum(row[key] >= 1 - LEAST for row in rows))
+                            for key in ("nearer", "nearer_with_misses"))])
+    return markdown(("scenes", "front layer's weight 10 to 90 % on", "nearer in 90 % of the pixels, by hits, on",
+                     "with misses, on"), lines)
 
 
 RESULT_TABLES: Mapping[str, Callable[[], str]] = {
     "bench": bench,
+    "scenes": scenes,
     "stages": stages,
+    "layer-cost": layer_cost,
     "growth": growth,
     "samples": samples,
     "paper-variants": variants,
@@ -213,4 +259,5 @@ RESULT_TABLES: Mapping[str, Callable[[], str]] = {
     "paper-losses": losses,
     "pairs": pairs,
     "layers-alive": alive,
+    "layers-alive-count": alive_count,
 }
