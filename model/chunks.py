@@ -13,7 +13,7 @@ from torch import Tensor
 
 from model.samples import Samples
 
-CHUNK_SAMPLES = 32768  # about 4 MB of activations at width 32
+CHUNK_SAMPLES = 16384  # about 2 MB of activations at width 32
 CHUNK_PIXELS = 8192  # the same for the stages per pixel and layer, where pixels hold few samples
 MAX_GROUPS = 4  # of different numbers of samples; more are left in the order they come
 
