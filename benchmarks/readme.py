@@ -67,7 +67,8 @@ def ratios(results: Results) -> dict[str, float]:
     """CPU time of each method's own work over OIDN's; empty without OIDN."""
     summary = results.summary(results.groups()[0])
     base = summary[YARDSTICK].own_cpu if YARDSTICK in summary else 0.0
-    return {name: row.own_cpu / base for name, row in summary.items() if base and row.own_cpu and name != YARDSTICK}
+    idle = {YARDSTICK, *(spec.name for spec in results.methods if spec.family == "input")}
+    return {name: row.own_cpu / base for name, row in summary.items() if base and row.own_cpu and name not in idle}
 
 
 def refresh(scenes: list[str], work: Path | None, threads: int, progress: ProgressKind) -> None:
