@@ -273,7 +273,7 @@ def to_pixel_type(values: npt.NDArray[np.float32], pixel_type: str) -> tuple[npt
 
 
 def tell_repairs(source: Path, repairs: dict[str, int], progress: Progress) -> None:
-    """One line on what was not finite in the input."""
+    """One line on what was broken in the input: not finite, or too large to be true."""
     if repairs:
         listed = ", ".join(f"{count} {role}" for role, count in sorted(repairs.items()))
-        progress.note(f"{source}: non-finite values were left out: {listed}")
+        progress.note(f"{source}: broken values were mended: {listed}")

@@ -95,8 +95,10 @@ def test_two_processes_make_the_curve_and_the_weights_of_one(folder: Path, whole
     assert said.count("step 2 ") == said.count("wrote ") == 1
     np.testing.assert_allclose(curve(folder, "two"), whole, rtol=1e-3, atol=1e-5)
     mine, theirs = (zoo.find(str(folder / out / "fast.safetensors")).load() for out in ("whole", "two"))
-    for a, b in zip(mine.parameters(), theirs.parameters(), strict=True):
-        torch.testing.assert_close(a, b, rtol=2e-2, atol=2e-3)
+    a, b = (torch.nn.utils.parameters_to_vector(net.parameters()).detach() for net in (mine, theirs))
+    # Adam's first steps are as long for a gradient that is all rounding as for any other: a few weights may differ.
+    assert float((a - b).norm() / a.norm()) < 1e-3
+    assert float((a - b).abs().gt(1e-3).float().mean()) < 1e-3
 
 
 @pytest.mark.parametrize(("number", "code", "word"), [(signal.SIGTERM, 143, "terminated"),
