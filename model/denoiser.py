@@ -277,7 +277,8 @@ class Denoiser(nn.Module):
     def _splat_samples(self, samples: Samples, embedding: Tensor, context: Tensor, scale: FrameScale) -> Tensor:
         """(B, 1, 6 + E, H, W) visible planes."""
         if len(embedding) < len(samples.weight):
-            parts = [(part.own, self.reducer(part.samples, scale)) for part in chunks(samples, None)]
+            parts = [(part.own, part.samples.in_pixel_order(self.reducer(part.samples, scale)))
+                     for part in chunks(samples, None)]
             embedding = together(parts, len(samples.weight))
         generator = self.generators[0]
         assert isinstance(generator, Mlp)
