@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from model.compositing import Layers
 from model.config import Config
 from model.denoiser import Denoiser
 from model.losses import total_loss
@@ -29,6 +30,7 @@ from pipelines.training.validation import UNIT, validate
 
 TIME_IS_UP = 1  # below the numbers of the signals that end a run
 GUARDED = 1 / 3  # of the run, in which the guard against a collapsed partition fades
+ORDER_MARGIN = 0.02  # log units of depth by which a layer should be behind the one in front of it
 BETAS = (0.9, 0.99)  # of Adam; steps are few and batches small, so its variance must not lag by a thousand steps
 
 Report = Callable[[str], None]
@@ -41,6 +43,16 @@ def learning_rate(step: int, recipe: Recipe) -> float:
     done = min((step - recipe.warmup) / max(recipe.steps - recipe.warmup, 1), 1.0)
     low = recipe.final_rate
     return recipe.learning_rate * (low + (1 - low) * 0.5 * (1 + math.cos(math.pi * done)))
+
+
+def disorder(layers: Layers) -> Tensor:
+    """How far layers lie behind those that should be behind them: log units of depth, times the lesser visible weight
+    of the two, mean over pixels and pairs of neighbours. Layers without hits are in nobody's way.
+    """
+    known = layers.depth.isfinite() & (layers.depth > 0)
+    zeta = torch.log(torch.where(known, layers.depth, 1))
+    wrong = (zeta[:, :-1] - zeta[:, 1:] + ORDER_MARGIN).clamp_min(0) * (known[:, :-1] & known[:, 1:])
+    return (torch.minimum(layers.weight[:, :-1], layers.weight[:, 1:]) * wrong).mean()
 
 
 class Objective(nn.Module):
@@ -60,6 +72,8 @@ class Objective(nn.Module):
         if guard > 0 and wanted > 1:
             share = layers.weight.mean((2, 3)).clamp_min(1e-6)  # (B, L): a layer that is never used is lost
             loss = loss + guard * (share * share.log()).sum(1).mean()
+        if self.recipe.depth_order and wanted > 1 and "depth" in batch.samples.roles:
+            loss = loss + self.recipe.depth_order * disorder(layers)
         # processes must agree on which parameters have a gradient: all have one, if only 0
         return loss + 0 * torch.stack([p.sum() for p in self.net.parameters()]).sum()
 

@@ -65,6 +65,9 @@ class Recipe:
     partition_entropy: Annotated[
         float, "weight of the guard against a collapsed partition; it fades in the first third of the run"
     ] = 0.02
+    depth_order: Annotated[
+        float, "weight of the guard of the layers' order: what lies behind the layer that should be behind it costs"
+    ] = 2.0
     bfloat16: Annotated[bool, "matrix products and convolutions in bfloat16"] = True
     seed: Annotated[int, "of everything that is random"] = 1
     validate_every: Annotated[int, "steps"] = 250

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+import math
 import os
 import signal
 from pathlib import Path
@@ -17,6 +18,7 @@ from PIL import Image
 
 from deep_io.errors import InputError, UsageError
 from model import zoo
+from model.compositing import Layers
 from model.denoiser import Denoiser
 from model.losses import LossWeights
 from model.samples import Samples
@@ -27,7 +29,7 @@ from pipelines.training.caching import build_cache
 from pipelines.training.drawing import PANEL_PIXELS, curve_png, panel_png
 from pipelines.training.group import ALONE, Group
 from pipelines.training.job import TrainOptions, starting_weights, train
-from pipelines.training.loop import Trainer, learning_rate
+from pipelines.training.loop import Trainer, disorder, learning_rate
 from pipelines.training.recipe import Augmentation, Recipe
 from pipelines.training.run_folder import CHECKPOINT, CURVE, CURVE_PICTURE, PANELS, RECIPE
 from pipelines.training.validation import pixel_means, validate
@@ -208,7 +210,7 @@ def test_training_lowers_the_loss_on_what_it_sees(cache: SampleCache, tmp_path: 
 
 def test_the_finish_minimises_its_own_loss(cache: SampleCache, tmp_path: Path) -> None:
     nothing = LossWeights(smape=0, relative=0, pooled=())
-    recipe = dataclasses.replace(QUICK, finish=0.5, finish_loss=nothing, partition_entropy=0.0)
+    recipe = dataclasses.replace(QUICK, finish=0.5, finish_loss=nothing, partition_entropy=0.0, depth_order=0.0)
     trainer = Trainer(SMALL, recipe, tmp_path)
     losses = [trainer.advance(random_batch(cache, recipe, step)) for step in range(recipe.steps)]
     assert [loss != 0 for loss in losses] == [True] * 3 + [False] * 3
@@ -337,3 +339,15 @@ def test_a_network_with_fewer_layers_than_a_batch_asks_for_uses_all_it_has(cache
     recipe = dataclasses.replace(QUICK, layers=((3, 1.0),))
     net = dataclasses.replace(SMALL, partition_logits=2)
     assert np.isfinite(Trainer(net, recipe, tmp_path).advance(random_batch(cache, recipe, 0)))
+
+
+def test_layers_in_order_of_depth_are_no_disorder_and_swapped_ones_are() -> None:
+    def layers(front: float, back: float, share: float) -> Layers:
+        plane = torch.tensor([front, back]).view(1, 2, 1, 1)
+        weight = torch.tensor([share, 1 - share]).view(1, 2, 1, 1)
+        return Layers(torch.zeros(1, 2, 3, 1, 1), weight, weight, plane, torch.zeros(1, 2, 0, 1, 1))
+
+    assert float(disorder(layers(1.0, 2.0, 0.3))) == 0.0
+    assert float(disorder(layers(2.0, 1.0, 0.3))) == pytest.approx(0.3 * (math.log(2) + 0.02))
+    assert float(disorder(layers(2.0, 1.0, 0.0))) == 0.0  # nothing of one layer to be seen
+    assert float(disorder(layers(2.0, math.inf, 0.3))) == 0.0  # a layer of misses
