@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -95,4 +96,5 @@ def joined(device: str) -> Iterator[Group]:
     try:
         yield Group(dist.get_rank(), dist.get_world_size(), mine)
     finally:
+        gc.collect()  # a group that outlives this in a cycle of references takes its threads down at exit, loudly
         dist.destroy_process_group()

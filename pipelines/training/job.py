@@ -64,32 +64,39 @@ def train(options: TrainOptions, report: Callable[[str], None] = print) -> Path:
     """
     if options.network not in CONFIGS:
         raise UsageError(f"--network {options.network}: there are {', '.join(CONFIGS)}")
-    config, recipe = CONFIGS[options.network], options.recipe
+    config = CONFIGS[options.network]
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     with joined(options.device) as group:
-        def say(text: str) -> None:
-            if group.leads:
-                report(text)
+        return _train(options, config, group, report)
 
-        group.first(lambda: _prepare(options, config, group, say))
-        training, held_out = (SampleCache(folder) for folder in cache_folders(options))
-        start = starting_weights(options.start, config) if options.start is not None else None
-        trainer = Trainer(config, recipe, options.out, start, group)
-        say(f"{len(training.entries)} scenes, {len(held_out.entries)} held out, crops of "
-            f"{crop_size(training.entries, recipe)} pixels, {group.size} process{'es'[:2 * (group.size > 1)]} on "
-            f"{group.device.type}, from step {trainer.step}")
-        trainer.run(training, held_out, say, options.seconds, options.save_every, options.loaders)
-        info = {
-            "description": f"{options.network}, trained by lbmc train",
-            "data": {"scenes": len(training.entries), "validation": len(held_out.entries)},
-            "recipe": recipe.to_dict(),
-            "steps": trainer.step,
-            "scores": trainer.state.rows[-1] if trainer.state.rows else {},
-        }
-        path = options.out / f"{options.network}{zoo.SUFFIX}"
-        group.first(lambda: trainer.folder.write_weights(path, trainer.averaged, info))
-        say(f"wrote {path}")
+
+def _train(options: TrainOptions, config: Config, group: Group, report: Callable[[str], None]) -> Path:
+    """One process's part. A function of its own: what holds on to the group is gone before the group is."""
+    recipe = options.recipe
+
+    def say(text: str) -> None:
+        if group.leads:
+            report(text)
+
+    group.first(lambda: _prepare(options, config, group, say))
+    training, held_out = (SampleCache(folder) for folder in cache_folders(options))
+    start = starting_weights(options.start, config) if options.start is not None else None
+    trainer = Trainer(config, recipe, options.out, start, group)
+    say(f"{len(training.entries)} scenes, {len(held_out.entries)} held out, crops of "
+        f"{crop_size(training.entries, recipe)} pixels, {group.size} process{'es'[:2 * (group.size > 1)]} on "
+        f"{group.device.type}, from step {trainer.step}")
+    trainer.run(training, held_out, say, options.seconds, options.save_every, options.loaders)
+    info = {
+        "description": f"{options.network}, trained by lbmc train",
+        "data": {"scenes": len(training.entries), "validation": len(held_out.entries)},
+        "recipe": recipe.to_dict(),
+        "steps": trainer.step,
+        "scores": trainer.state.rows[-1] if trainer.state.rows else {},
+    }
+    path = options.out / f"{options.network}{zoo.SUFFIX}"
+    group.first(lambda: trainer.folder.write_weights(path, trainer.averaged, info))
+    say(f"wrote {path}")
     return path
 
 
