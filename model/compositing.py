@@ -104,8 +104,11 @@ def to_layers(visible: Tensor) -> Layers:
     """Visible planes (B, L, 6 + E, H, W), see `composite` -> `Layers`."""
     color, coverage, depth, weight = visible[:, :, :3], visible[:, :, 3], visible[:, :, 4], visible[:, :, 5]
     some = coverage > 0
-    return Layers(color, weight, coverage, torch.where(some, depth / torch.where(some, coverage, 1), torch.inf),
-                  visible[:, :, 6:])
+    by = torch.where(some, coverage, 1)
+    if torch.is_grad_enabled():  # the derivative divides by the square, which must not vanish: 0 / 0 would spread
+        firm = by > torch.finfo(by.dtype).tiny ** 0.5
+        by, depth = torch.where(firm, by, by.detach()), torch.where(firm, depth, depth.detach())
+    return Layers(color, weight, coverage, torch.where(some, depth / by, torch.inf), visible[:, :, 6:])
 
 
 def fill_holes(layers: Layers) -> Layers:

@@ -29,6 +29,11 @@ class UNetConfig:
     decoder: Widths  # coarsest first; as many blocks as the encoder
     head: tuple[int, ...] = ()  # further convolutions at the finest resolution
     scale: int = 1  # the network works at 1/scale of the picture's resolution
+    fine: tuple[int, ...] = ()  # convolutions behind it at the picture's own resolution; the first is 1x1
+
+    def __post_init__(self) -> None:
+        if self.fine and self.scale == 1:
+            raise ValueError("fine convolutions are for a U-Net below the picture's resolution")
 
     @property
     def out_channels(self) -> int:

@@ -93,7 +93,17 @@ def _unet(inputs: int, unet: UNetConfig) -> Stage:
         blocks.append(_block(below + skip, widths, resolution))
         below, resolution = widths[-1], resolution / 4
     blocks.append(_block(below, unet.head, resolution * 4))
+    if unet.fine:
+        blocks.append(_fine(inputs, unet))
     return Stage("unet", sum(block[0] for block in blocks), pixel=sum(block[1] for block in blocks))
+
+
+def _fine(inputs: int, unet: UNetConfig) -> tuple[int, float]:
+    """Parameters and multiply-adds per pixel of the convolutions behind a U-Net at a lower resolution."""
+    first, last, context = unet.fine[0], unet.fine[-1], unet.out_channels
+    parameters, products = _block(first, unet.fine[1:], 1.0)
+    return (parameters + (inputs + context + 1) * first + (last + 1) * context,
+            products + inputs * first + context * first / unet.scale**2 + last * context)
 
 
 def _split_mlp(shared: int, own: int, widths: Sequence[int]) -> tuple[int, float, float]:

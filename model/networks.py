@@ -105,6 +105,36 @@ class _Block(nn.Module):
         return x
 
 
+class _Fine(nn.Module):
+    """Adds to an upsampled context what the picture itself shows between the pixels of the coarser network.
+
+    The last layer starts at zero: the context is at first the upsampled one.
+    """
+
+    def __init__(self, inputs: int, context: int, widths: Sequence[int]) -> None:
+        super().__init__()
+        self.from_picture = nn.Conv2d(inputs, widths[0], 1)
+        self.from_context = nn.Conv2d(context, widths[0], 1, bias=False)
+        for convolution in (self.from_picture, self.from_context):
+            _xavier(convolution)
+        self.block = _Block(widths[0], widths[1:])
+        self.last = nn.Conv2d(widths[-1], context, 1)
+        nn.init.zeros_(self.last.weight)
+        assert self.last.bias is not None
+        nn.init.zeros_(self.last.bias)
+
+    def forward(self, picture: Tensor, context: Tensor) -> Tensor:
+        """picture (B, inputs, H, W), context (B, C, H / scale, W / scale) -> (B, C, H, W)."""
+        size = picture.shape[-2:]
+        x = self.from_picture(picture) + _enlarged(self.from_context(context), size)
+        added: Tensor = self.last(self.block(F.leaky_relu_(x, LEAK)))
+        return _enlarged(context, size) + added
+
+
+def _enlarged(x: Tensor, size: Sequence[int]) -> Tensor:
+    return F.interpolate(x, size=tuple(size), mode="bilinear", align_corners=False)
+
+
 class UNet(Products):
     """Pictures (B, inputs, H, W) -> context (B, out_channels, H, W), H and W multiples of `config.stride`.
 
@@ -124,6 +154,7 @@ class UNet(Products):
             self.decoder.append(_Block(below + skip, widths))
             below = widths[-1]
         self.head = _Block(below, config.head)
+        self.fine = _Fine(inputs, config.out_channels, config.fine) if config.fine else None
 
     def forward(self, x: Tensor) -> Tensor:
         return self.levels(x)[-1]
@@ -134,7 +165,7 @@ class UNet(Products):
             return self._levels(x)
 
     def _levels(self, x: Tensor) -> list[Tensor]:
-        full = x.shape[-2:]
+        picture = x
         if self.config.scale > 1:
             x = F.avg_pool2d(x, self.config.scale)
         skips = []
@@ -148,7 +179,9 @@ class UNet(Products):
             x = block(torch.cat([x, skip], 1))
             outputs.append(x)
         x = self.head(x)
-        if self.config.scale > 1:
-            x = F.interpolate(x, size=full, mode="bilinear", align_corners=False)
+        if self.fine is not None:
+            x = self.fine(picture, x)
+        elif self.config.scale > 1:
+            x = _enlarged(x, picture.shape[-2:])
         outputs[-1] = x
         return outputs

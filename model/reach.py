@@ -43,6 +43,7 @@ def unet_span(span: Span, unet: UNetConfig, level: int = 0) -> Span:
     Level 0 is the network's own output, upsampled from 1/scale; levels above 0 exist for scale 1.
     """
     if level == 0:
+        span = _grow(span, max(len(unet.fine) - 1, 0))  # the first is 1x1
         if unet.scale > 1:
             span = _bilinear(span, unet.scale)
         span = _grow(span, len(unet.head))

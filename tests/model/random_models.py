@@ -16,7 +16,7 @@ from model.samples import ROLE_WIDTHS, Samples
 UNET = UNetConfig(
     encoder=((5, 5), (6,), (6,)), bottleneck=(6,), decoder=((6,), (6, 6), (5,)), head=(4,)
 )
-HALF_UNET = UNetConfig(encoder=((5, 5), (6,)), bottleneck=(6,), decoder=((6,), (6, 5)), scale=2)
+HALF_UNET = UNetConfig(encoder=((5, 5), (6,)), bottleneck=(6,), decoder=((6,), (6, 5)), scale=2, fine=(4, 3))
 
 
 def _small(name: str, kernel_sizes: tuple[int, ...], **changes: Any) -> Config:

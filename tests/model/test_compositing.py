@@ -82,3 +82,18 @@ def test_filling_leaves_reached_pixels_and_empty_pictures_alone() -> None:
     nothing: Layers = to_layers(torch.zeros(1, 2, 6, 4, 4))
     assert bool((fill_holes(nothing).color == 0).all())
     assert bool((fill_holes(nothing).weight == 0).all())
+
+
+def test_a_layer_with_hardly_any_coverage_has_a_gradient() -> None:
+    """Its depth is a quotient of two vanishing numbers; the square of the lower one is 0 in float32."""
+    visible = torch.zeros(1, 2, 6, 1, 2)
+    visible[:, :, 5] = 0.5
+    visible[:, :, 3] = torch.tensor([0.5, 1e-30])  # the second pixel's layers hardly cover it
+    visible[:, :, 4] = visible[:, :, 3] * 7
+    visible.requires_grad_()
+    layers = to_layers(visible)
+    torch.testing.assert_close(layers.depth.detach(), torch.full((1, 2, 1, 2), 7.0))
+    layers.depth.log().sum().backward()
+    assert visible.grad is not None
+    assert visible.grad.isfinite().all()
+    assert visible.grad[0, 0, 4, 0, 0] != 0

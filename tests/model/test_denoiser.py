@@ -123,12 +123,14 @@ def test_order_of_samples_is_irrelevant(case: tuple[Denoiser, Samples, int]) -> 
 def blind_to_count(net: Denoiser) -> Denoiser:
     """Cuts the one input that may tell a split sample, the effective count: the last channel of the context's input.
 
-    The U-Net reads it twice: at its start, and through the skip to its last block.
+    The U-Net reads it twice, at its start and through the skip to its last block; convolutions behind it, once more.
     """
     if net.config.statistics:
-        for block in (net.unet.encoder[0], net.unet.decoder[-1]):
-            with torch.no_grad():
-                block.convolutions[0].weight[:, -1] = 0
+        unet = net.unet
+        readers = [unet.encoder[0].convolutions[0], unet.decoder[-1].convolutions[0]]
+        with torch.no_grad():
+            for convolution in readers + ([unet.fine.from_picture] if unet.fine is not None else []):
+                convolution.weight[:, -1] = 0
     return net
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -21,10 +23,10 @@ def thin(unet: UNetConfig) -> UNetConfig:
         return tuple(tuple(1 for _ in block) for block in blocks)
 
     return UNetConfig(ones(unet.encoder), ones((unet.bottleneck,))[0], ones(unet.decoder), ones((unet.head,))[0],
-                      unet.scale)
+                      unet.scale, ones((unet.fine,))[0])
 
 
-@pytest.mark.parametrize("config", [UNET, HALF_UNET, FAST.unet, LAYER.unet])
+@pytest.mark.parametrize("config", [UNET, HALF_UNET, replace(HALF_UNET, fine=()), FAST.unet, LAYER.unet])
 def test_span_of_a_unet_is_exact(config: UNetConfig) -> None:
     """With positive weights, no biases and a dark picture, an output is above 0 only if it sees the one light."""
     net = UNet(1, thin(config)).double()
