@@ -54,7 +54,7 @@ def train(
     """Train a network on DATA, a folder of NAME.deep.exr with NAME.ref.exr; OUT gets checkpoints, curves and weights.
 
     A run that finds its own checkpoint in OUT resumes it. Several processes, with a GPU each where there are GPUs:
-    torchrun --standalone --nproc-per-node 2 --no-python lbmc train ...
+    torchrun --standalone --nproc-per-node 2 --no-python -- lbmc train ...
     """
     from pipelines.allocator import keep_freed_memory
     from pipelines.training import job

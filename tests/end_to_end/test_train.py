@@ -23,7 +23,7 @@ from tests.pipelines.training_data import SIZE, uneven, write_example
 from tests.runner import LBMC, environment, in_process
 
 TORCHRUN = Path(sys.executable).parent / "torchrun"
-TWO = (TORCHRUN, "--standalone", "--nproc-per-node", "2", "--no-python")
+TWO = (TORCHRUN, "--standalone", "--nproc-per-node", "2", "--no-python", "--")
 STEPS, EVERY = 6, 2
 QUICK = ("--steps", STEPS, "--validate-every", EVERY, "--batch", 3, "--crop", 32, "--threads", 1, "--set", "warmup=1",
          "--set", "bfloat16=false")
