@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """What modelling only what a scene needs saves, and what it costs: one row for each saving.
 
-    python benchmarks/bench_adapting.py FOLDER [--model fast] [--repeats 3] [--json OUT.json]
+    python benchmarks/bench_adapting.py FOLDER... [--model fast] [--repeats 3] [--json docs/results/adapting.json]
 
-FOLDER holds NAME.deep.exr with NAME.ref.exr. Each saving is measured on the scenes where the survey chooses it and,
+A FOLDER holds NAME.deep.exr with NAME.ref.exr. docs/tables.py makes the tables of docs/adapting.md of the JSON. Each saving is measured on the scenes where the survey chooses it and,
 forced, on those where it does not. Scenes that need less are also made of the others: crops in which depth does not
 mix, and frames of several tiles whose upper half is plain sky or holds no samples. Time is the CPU time of the network,
 the runs with and without a saving taking turns, medians; error is relMSE, its ratio averaged geometrically.
@@ -233,16 +233,17 @@ def table(bench: Bench, scenes: list[Scene], note: Callable[[str], None]) -> lis
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
     parser.add_argument("--model", default="fast")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    paths = [path for path in sorted(options.folder.glob("*.deep.exr")) if reference_of(path).exists()]
-    if not paths:
-        sys.exit(f"ERROR: {options.folder}: no NAME.deep.exr with a NAME.ref.exr beside it")
-    bench = Bench(options.model, options.repeats)
-    scenes = [bench.load(path) for path in paths]
+    bench, scenes = Bench(options.model, options.repeats), []
+    for folder in options.folders:
+        paths = [path for path in sorted(folder.glob("*.deep.exr")) if reference_of(path).exists()]
+        if not paths:
+            sys.exit(f"ERROR: {folder}: no NAME.deep.exr with a NAME.ref.exr beside it")
+        scenes += [bench.load(path) for path in paths]
     rows = table(bench, scenes, lambda text: print(text, file=sys.stderr))
     print("| saving | scenes | number | CPU s without | saved | relMSE | largest change outside |\n" + "|---" * 7 + "|")
     print("\n".join(row.line() for row in rows))

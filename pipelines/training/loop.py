@@ -46,13 +46,14 @@ def learning_rate(step: int, recipe: Recipe) -> float:
 
 
 def disorder(layers: Layers) -> Tensor:
-    """How far layers lie behind those that should be behind them: log units of depth, times the lesser visible weight
-    of the two, mean over pixels and pairs of neighbours. Layers without hits are in nobody's way.
+    """How far layers lie behind those that should be behind them: log units of depth, times the lesser coverage of the
+    two, mean over pixels and pairs of neighbours. Layers without hits are in nobody's way, and where hits are few they
+    count little: else the derivative, which divides by the coverage, would have no bound.
     """
     known = layers.depth.isfinite() & (layers.depth > 0)
     zeta = torch.log(torch.where(known, layers.depth, 1))
     wrong = (zeta[:, :-1] - zeta[:, 1:] + ORDER_MARGIN).clamp_min(0) * (known[:, :-1] & known[:, 1:])
-    return (torch.minimum(layers.weight[:, :-1], layers.weight[:, 1:]) * wrong).mean()
+    return (torch.minimum(layers.coverage[:, :-1], layers.coverage[:, 1:]) * wrong).mean()
 
 
 class Objective(nn.Module):

@@ -18,7 +18,7 @@ from PIL import Image
 
 from deep_io.errors import InputError, UsageError
 from model import zoo
-from model.compositing import Layers
+from model.compositing import Layers, to_layers
 from model.denoiser import Denoiser
 from model.losses import LossWeights
 from model.samples import Samples
@@ -351,3 +351,15 @@ def test_layers_in_order_of_depth_are_no_disorder_and_swapped_ones_are() -> None
     assert float(disorder(layers(2.0, 1.0, 0.3))) == pytest.approx(0.3 * (math.log(2) + 0.02))
     assert float(disorder(layers(2.0, 1.0, 0.0))) == 0.0  # nothing of one layer to be seen
     assert float(disorder(layers(2.0, math.inf, 0.3))) == 0.0  # a layer of misses
+
+
+def test_the_gradient_of_disorder_is_bounded_where_a_layer_has_hardly_any_hits() -> None:
+    """The depth is a quotient; by itself its derivative grows as 1 over the coverage, and one pixel would be a step."""
+    planes = torch.zeros(1, 2, 6, 1, 1)
+    planes[:, :, 5, 0, 0] = 0.5
+    planes[0, :, 3, 0, 0] = torch.tensor([1e-12, 0.5])
+    planes[0, :, 4, 0, 0] = torch.tensor([9e-12, 0.5])  # nine units away, in front of a layer one unit away
+    planes.requires_grad_()
+    disorder(to_layers(planes)).backward()
+    assert planes.grad is not None
+    assert 0 < planes.grad.abs().max() < 10
