@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
@@ -27,6 +25,7 @@ from pipelines.rendering.shots import RenderSettings, Shot, take_shot
 from pipelines.rendering.stage import Stage
 from pipelines.rendering.stage_scene import StageTracer
 from pipelines.rendering.tracer import SceneTracer
+from pipelines.rendering.workers import worker_pool
 
 CONTACT_SHEET = "contact-sheet.png"
 
@@ -107,7 +106,9 @@ def render_scenes(options: RenderOptions, progress_kind: ProgressKind = "auto",
     with make_progress(progress_kind, len(missing)) as progress:
         if len(missing) < len(seeds):
             progress.note(f"{len(seeds) - len(missing)} of {len(seeds)} examples are there already")
-        with _renderer(options, missing) as render:
+        here = partial(render_and_write, options)
+        several = options.workers > 1 and len(missing) > 1
+        with worker_pool(options.workers, here, missing) if several else nullcontext(here) as render:
             def work(seed: int, progress: Progress) -> str:
                 line = render(seed)
                 (report or progress.note)(line)
@@ -118,21 +119,6 @@ def render_scenes(options: RenderOptions, progress_kind: ProgressKind = "auto",
     if options.contact_sheet and complete:
         write_contact_sheet(options.outdir / CONTACT_SHEET, complete)
     return done
-
-
-@contextmanager
-def _renderer(options: RenderOptions, seeds: list[int]) -> Iterator[Callable[[int], str]]:
-    """A function from seed to line: here, or in a pool that is already at work on all seeds."""
-    if options.workers <= 1 or len(seeds) <= 1:
-        yield partial(render_and_write, options)
-        return
-    # Spawned, not forked: Dr.Jit's threads do not survive a fork.
-    pool = ProcessPoolExecutor(options.workers, multiprocessing.get_context("spawn"))
-    try:
-        futures: dict[int, Future[str]] = {seed: pool.submit(render_and_write, options, seed) for seed in seeds}
-        yield lambda seed: futures[seed].result()
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _check(options: RenderOptions) -> None:
