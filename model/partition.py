@@ -109,8 +109,9 @@ def extra_values(samples: Samples) -> list[Tensor]:
 
 
 def share_of(log_n: Tensor, log_w: Tensor) -> Tensor:
-    """w / n in 0..1, 0 where nothing is."""
-    return torch.exp(log_w - torch.where(log_n == -torch.inf, 0, log_n))
+    """w / n in 0..1, 0 where next to nothing is: what is divided by it has a derivative over its square."""
+    share = torch.exp(log_w - torch.where(log_n == -torch.inf, 0, log_n))
+    return torch.where(share > torch.finfo(share.dtype).tiny ** 0.5, share, 0)
 
 
 def splat(log_weight: Tensor, log_partition: Tensor, values: Tensor, segments: Segments) -> LayerSplat:

@@ -17,6 +17,7 @@ from model.partition import (
     log_sum_behind,
     mixture,
     relative_depth,
+    share_of,
     splat,
     window_sums,
 )
@@ -128,3 +129,16 @@ def test_logs_of_sums_behind_each_layer() -> None:
     partition = torch.softmax(torch.randn(6, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64), 1)
     expected = partition.flip(1).cumsum(1).flip(1)
     torch.testing.assert_close(log_sum_behind(partition.log()).exp(), expected)
+
+
+def test_a_share_that_is_too_small_to_divide_by_is_none() -> None:
+    """A mean is a sum over the share, its derivative one over the share's square: 0/0 in float32 below 1e-19."""
+    log_w = torch.tensor([-100.0, -30.0, -torch.inf], requires_grad=True)
+    share = share_of(torch.zeros(3), log_w)
+    assert share[0] == 0 == share[2]
+    assert share[1].item() == pytest.approx(math.exp(-30))
+    total = torch.exp(log_w.detach()).requires_grad_()
+    (total / torch.where(share > 0, share, 1)).sum().backward()
+    for values in (log_w, total):
+        assert values.grad is not None
+        assert values.grad.isfinite().all()

@@ -1,0 +1,31 @@
+"""The tables of docs/adapting.md, made from docs/results/adapting.json, which benchmarks/bench_adapting.py writes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from result_tables import markdown
+
+from model.metrics import geometric_mean
+
+RESULTS = Path(__file__).resolve().parent / "results" / "adapting.json"
+
+
+def savings() -> str:
+    """One row for each saving: time saved, error added, where the survey chooses it and where it is forced."""
+    head = ("saving", "scenes", "number", "network's time saved", "relMSE (worst)", "largest change elsewhere")
+    return markdown(head, (_line(row) for row in json.loads(RESULTS.read_text("utf-8"))["rows"]))
+
+
+def _line(row: Mapping[str, Any]) -> list[str]:
+    saved = 1 - sum(row["after"]) / sum(row["before"])
+    errors = row["errors"]
+    error = f"{100 * (geometric_mean(errors) - 1):+.1f} % ({100 * (max(errors) - 1):+.1f} %)" if errors else "–"
+    change = f"{max(row['change']):.0e}" if row["change"] else "–"
+    return [row["label"], row["scenes"], str(len(row["before"])), f"{100 * saved:.0f} %", error, change]
+
+
+ADAPTING_TABLES: Mapping[str, Callable[[], str]] = {"adapting": savings}
