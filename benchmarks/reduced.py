@@ -7,7 +7,9 @@ Reduced means: U-Nets a quarter as wide, the small networks half as wide, kernel
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+
+from trials import Run
 
 from model.config import FAST, LAYER, LAYER_W, OPTIMIZED, PIXEL_GATHER, SAMPLE_SPLAT, Config, UNetConfig
 from model.losses import LossWeights
@@ -20,25 +22,6 @@ PLAIN = Augmentation(permute_colors=False, drop_roles=0.0, fireflies=0.0)
 PAPER_RECIPE = Recipe(steps=250, batch=2, crop=64, samples=((8, 1.0),), loss=SMAPE, augmentation=PLAIN,
                       partition_entropy=0.0)
 OUR_RECIPE = Recipe(steps=200, batch=2, crop=96, samples=((8, 1.0),), augmentation=PLAIN)
-
-
-@dataclass(frozen=True)
-class Run:
-    """One network to be trained.
-
-    name : of the network, as tables have it
-    group : "paper" or "ours": runs of one group had the same crops in the same order
-    """
-
-    name: str
-    group: str
-    config: Config
-    recipe: Recipe
-
-    @property
-    def key(self) -> str:
-        """Of its row, and of its files."""
-        return f"{self.name.replace(' ', '-').replace(',', '')}.{self.recipe.seed}"
 
 
 def reduced(config: Config) -> Config:

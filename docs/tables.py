@@ -18,6 +18,7 @@ from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from ablation_tables import ABLATION_TABLES
 from result_tables import RESULT_TABLES
 
 from deep_io.aliases import ALIASES, CAMERA_Z_FORWARD, DISTANCE, NOT_A_ROLE, RENDERER_MARKS, VIEW, WORLD, Alias
@@ -119,6 +120,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "networks": networks,
     "recipe": recipe,
     **RESULT_TABLES,
+    **ABLATION_TABLES,
 }
 
 

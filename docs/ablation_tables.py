@@ -1,0 +1,110 @@
+"""The tables of docs/ablations.md, made from what benchmarks/ablations.py left in docs/results/ablations.json."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model.metrics import geometric_mean
+
+ABLATIONS = Path(__file__).resolve().parent / "results" / "ablations.json"
+BASE, LAYER_TOPICS = "base", ("", "layers")
+MEANS: Mapping[str, Callable[[list[float]], float]] = {
+    "relmse": geometric_mean, "trimmed": geometric_mean, "smape": lambda values: float(np.mean(values))}
+"""How each error is averaged over scenes."""
+TITLES = {"relmse": "relMSE", "trimmed": "trimmed", "smape": "SMAPE"}
+Row = dict[str, Any]
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table whose columns, but for the first two, are numbers."""
+    lines = [head, ["---", "---", *["---:"] * (len(head) - 2)], *rows]
+    return "".join(f"| {' | '.join(row)} |\n" for row in lines)
+
+
+def runs_of(document: Row) -> dict[str, dict[int, Row]]:
+    """Rows by name and seed, with the errors over all scenes that they were scored on."""
+    found: dict[str, dict[int, Row]] = {}
+    for row in document["rows"].values():
+        scenes = [scene for scenes in row["scenes"].values() for scene in scenes.values()]
+        errors = {key: mean([scene[key] for scene in scenes]) for key, mean in MEANS.items()}
+        found.setdefault(row["name"], {})[row["seed"]] = {**row, "errors": errors}
+    return found
+
+
+def spread(base: Mapping[int, Row], key: str) -> float:
+    """The base's largest error over its smallest, among seeds; infinite for one seed, which tells nothing."""
+    values = [row["errors"][key] for row in base.values()]
+    return max(values) / min(values) if len(values) > 1 else float("inf")
+
+
+def ratios(rows: Mapping[int, Row], base: Mapping[int, Row], key: str) -> list[float]:
+    """Of a change's errors to the base's of the same seed."""
+    return [rows[seed]["errors"][key] / base[seed]["errors"][key] for seed in sorted(rows) if seed in base]
+
+
+def stands_out(values: Sequence[float], within: float) -> bool:
+    """Whether the seeds agree that it is better, or worse, by more on average than the base's seeds differ."""
+    mean = geometric_mean(list(values))
+    agreed = all(value > 1 for value in values) or all(value < 1 for value in values)
+    return agreed and max(mean, 1 / mean) > within
+
+
+def cell(values: Sequence[float], within: float) -> str:
+    """The mean ratio, bold where it stands out, and the range of several."""
+    text = f"{geometric_mean(list(values)):.3f}"
+    if stands_out(values, within):
+        text = f"**{text}**"
+    return text if len(values) == 1 else f"{text} ({min(values):.2f} to {max(values):.2f})"
+
+
+def mean_of(rows: Mapping[int, Row], key: str) -> float:
+    return float(np.mean([row[key] for row in rows.values()]))
+
+
+def costs(rows: Mapping[int, Row]) -> list[str]:
+    """Multiply-adds, CPU seconds of training and of denoising, share of pixels whose layers are in order."""
+    topical = all("nearer_with_misses" in row and row["group"] in LAYER_TOPICS for row in rows.values())
+    order = f"{100 * mean_of(rows, 'nearer_with_misses'):.1f} %" if topical else "–"
+    return [f"{mean_of(rows, 'multiply_adds') / 1e3:.1f} k", f"{mean_of(rows, 'cpu_seconds_a_step'):.2f}",
+            f"{mean_of(rows, 'cpu_seconds_a_megapixel'):.1f}", order]
+
+
+def changes(document: Row) -> str:
+    """Every change of the base, topic by topic."""
+    found = runs_of(document)
+    base = found.pop(BASE)
+    lines = [["", "the base", str(len(base)), *["1"] * len(MEANS), *costs(base)]]
+    topics = list(dict.fromkeys(row["group"] for rows in found.values() for row in rows.values()))
+    for topic in topics:
+        for name, rows in found.items():
+            paired = {seed: row for seed, row in rows.items() if seed in base and row["group"] == topic}
+            if paired:
+                cells = [cell(ratios(paired, base, key), spread(base, key)) for key in MEANS]
+                lines.append([topic, name, str(len(paired)), *cells, *costs(paired)])
+    return markdown(("topic", "change", "seeds", *TITLES.values(), "multiply-adds", "CPU s a step", "CPU s a Mpx",
+                     "front is nearer"), lines)
+
+
+def seeds(document: Row) -> str:
+    """The base, seed by seed, and its spread."""
+    base = runs_of(document)[BASE]
+    lines = [[f"seed {seed}", *(f"{row['errors'][key]:.4f}" for key in MEANS)] for seed, row in sorted(base.items())]
+    if len(base) > 1:
+        lines.append(["largest over smallest", *(f"{spread(base, key):.3f}" for key in MEANS)])
+    return markdown(("the base", *TITLES.values()), lines)
+
+
+def load() -> Row:
+    document: Row = json.loads(ABLATIONS.read_text("utf-8"))
+    return document
+
+
+ABLATION_TABLES: Mapping[str, Callable[[], str]] = {
+    "ablations": lambda: changes(load()),
+    "ablations-base": lambda: seeds(load()),
+}
