@@ -56,7 +56,7 @@ def find_llvm() -> str:
 def load_mitsuba(threads: int = 0) -> Any:
     """The mitsuba module with its variant set and `threads` workers (0: one per core).
 
-    Raises RendererMissingError with the package to install. Only the first call's `threads` counts.
+    Raises RendererMissingError with the package to install. The last number of threads asked for counts.
     """
     os.environ["DRJIT_LIBLLVM_PATH"] = find_llvm()
     try:

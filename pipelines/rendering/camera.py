@@ -1,4 +1,4 @@
-"""The thin-lens camera: moving pose, rays, projection and circle of confusion, in NumPy or Dr.Jit alike.
+"""The thin-lens camera: its numbers (Camera), and its rays, projection and blur on the device (CameraRig).
 
 Camera space is x right, y up, z forward (planar depth); pixels are x right, y down. Signs follow the deep sample file:
 coc is positive behind the focus plane, and pixel = pinhole projection - coc * lens.

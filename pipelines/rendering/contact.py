@@ -6,6 +6,7 @@ One strip per example: mean of its first eight samples, reference, albedo, and b
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -48,12 +49,19 @@ def strip(stem: Path) -> Picture:
     return (np.clip(np.concatenate(pictures, 1), 0, 1) ** (1 / GAMMA) * 255).astype(np.uint8)
 
 
-def write_contact_sheet(target: Path, stems: list[Path]) -> None:
-    """A PNG of up to SHOWN of the examples `stems`, spread evenly over them. Raises UsageError without Pillow."""
+def load_pillow() -> Any:
+    """The PIL.Image module. Raises UsageError with the package to install."""
     try:
         from PIL import Image
     except ImportError as missing:
-        raise UsageError(f"{target}: needs Pillow ({missing}): pip install 'lbmc[render]'") from missing
+        raise UsageError(
+            f"a contact sheet needs Pillow ({missing}): pip install 'lbmc[render]', or pass --no-contact-sheet"
+        ) from missing
+    return Image
+
+
+def write_contact_sheet(target: Path, stems: list[Path]) -> None:
+    """A PNG of up to SHOWN of the examples `stems`, spread evenly over them. Raises UsageError without Pillow."""
     chosen = [stems[i] for i in np.unique(np.linspace(0, len(stems) - 1, min(SHOWN, len(stems))).astype(int))]
     strips = [strip(stem) for stem in chosen]
     height, width = (max(s.shape[axis] for s in strips) for axis in (0, 1))
@@ -63,4 +71,4 @@ def write_contact_sheet(target: Path, stems: list[Path]) -> None:
         y, x = number // columns * height, number % columns * width
         sheet[y:y + picture.shape[0], x:x + picture.shape[1]] = picture
     with atomic_output(target) as path:
-        Image.fromarray(sheet).save(path, format="PNG")
+        load_pillow().fromarray(sheet).save(path, format="PNG")

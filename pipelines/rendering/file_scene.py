@@ -16,11 +16,12 @@ import numpy.typing as npt
 from deep_io.errors import InputError
 from pipelines.rendering.backend import load_mitsuba
 from pipelines.rendering.camera import ROLL, Camera
+from pipelines.rendering.materials import DIELECTRIC_F0
 from pipelines.rendering.tracer import Motion, MovingMesh, SceneTracer, SurfaceLook, Vector
 
 NEAR_SENSOR_SHARE = 0.6  # of the views start from the file's own camera
 LARGEST_MOVABLE = 0.35  # of the scene's diagonal
-DIELECTRIC_F0 = 0.04
+INSTANCE = "Instance"  # Mitsuba's name of the class
 
 
 class FileTracer(SceneTracer):
@@ -38,11 +39,21 @@ class FileTracer(SceneTracer):
         if not scene.shapes() or not scene.emitters():
             missing = "lights" if scene.shapes() else "shapes"
             raise InputError(f"{path}: has no {missing}; add some to render it")
+        for index, shape in enumerate(scene.shapes()):
+            if shape.class_name() == INSTANCE:
+                # Rays hit the shapes of its group, whose materials are not among those of the scene's own shapes.
+                raise InputError(f"{path}: has instances of shape groups, which cannot be rendered; make them meshes")
+            if not shape.id():
+                # Shapes are moved by name, and few files name theirs.
+                shape.set_id(f"shape {index} of lbmc")
         super().__init__(scene, [surface_look(mi, shape.bsdf()) for shape in scene.shapes()], threads)
         box = scene.bbox()
         self._low, self._high = (np.array(corner, np.float64).ravel() for corner in (box.min, box.max))
         self._read_sensor()
         self._rest = self._movable_meshes()
+        # Normals that the file gives are lost when a mesh moves: Mitsuba works them out anew.
+        names = (f"{name}.vertex_normals" for name, _, _ in self._rest.values())
+        self._rest_normals = {name: self.mi.Float(self.params[name]) for name in names if name in self.params}
 
     def _read_sensor(self) -> None:
         mi, sensor = self.mi, self.scene.sensors()[0]
@@ -93,6 +104,11 @@ class FileTracer(SceneTracer):
 
     def close(self) -> None:
         self._move_to(0.5)
+        for mesh in self._moving:
+            name = f"{mesh.name}.vertex_normals"
+            if name in self._rest_normals:
+                self.params[name] = self.mi.Float(self._rest_normals[name])
+        self.params.update()
         self.set_moving([])
 
 

@@ -119,7 +119,7 @@ def tube(path: npt.ArrayLike, radius: float | npt.NDArray[np.float64], sides: in
     helper = np.where(np.abs(tangent[:, 1:2]) > 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     side = np.cross(tangent, helper)
     side /= np.linalg.norm(side, axis=1, keepdims=True) + 1e-12
-    other = np.cross(side, tangent)
+    other = np.cross(tangent, side)  # this way round, the faces look outwards
     angle = np.linspace(0, 2 * np.pi, sides + 1)[None, :, None]
     r = np.broadcast_to(np.asarray(radius, np.float64), (len(p),))[:, None, None]
     length = float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum())
@@ -130,7 +130,7 @@ def tube(path: npt.ArrayLike, radius: float | npt.NDArray[np.float64], sides: in
 def torus(major: float, minor: float, segments: int = 32, sides: int = 10) -> Mesh:
     """A ring about y."""
     a = np.linspace(0, 2 * np.pi, segments + 1)[:, None]
-    b = np.linspace(0, 2 * np.pi, sides + 1)[None]
+    b = np.linspace(2 * np.pi, 0, sides + 1)[None]  # this way round, the faces look outwards
     r = major + minor * np.cos(b)
     return surface(np.stack([r * np.sin(a), minor * np.sin(b) + 0 * a, r * np.cos(a)], -1), (1.0, 4.0))
 

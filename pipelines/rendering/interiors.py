@@ -66,13 +66,14 @@ def _window_dressing(stage: Stage, corner: Vector, along: Vector, inward: Vector
         stage.add(g.quad(point(x0, y0, 0.08), along * (x1 - x0), UP * (y1 - y0)), slot)
 
 
-def _glowing_window(stage: Stage, corner: Vector, along: Vector, inward: Vector,
+def glowing_window(stage: Stage, corner: Vector, along: Vector, inward: Vector,
                     opening: Opening) -> None:
     """An evenly bright panel outside an opening, as lighters put there in place of a sky."""
     x0, y0, x1, y1 = opening
     slot = stage.light(stage.warm_or_cool(stage.rng.uniform(5, 20)))
-    stage.add(g.quad(corner + along * (x0 - 0.3) + UP * (y0 - 0.3) - inward * 0.4, UP * (y1 - y0 + 0.6),
-                     along * (x1 - x0 + 0.6)), slot)
+    # Lights shine along the cross product of their edges, which must be `inward`.
+    stage.add(g.quad(corner + along * (x0 - 0.3) + UP * (y0 - 0.3) - inward * 0.4, along * (x1 - x0 + 0.6),
+                     UP * (y1 - y0 + 0.6)), slot)
 
 
 def interior(stage: Stage) -> None:
@@ -106,7 +107,7 @@ def interior(stage: Stage) -> None:
         glowing = rng.random() < 0.6
         for opening in openings:
             if glowing:
-                _glowing_window(stage, corner, along, inward, opening)
+                glowing_window(stage, corner, along, inward, opening)
             _window_dressing(stage, corner, along, inward, opening)
     if windowed:
         inward = sides[min(windowed)][3]

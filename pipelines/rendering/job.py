@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from deep_io.errors import InputError, UsageError
 from pipelines.jobs import JobReport, run_frames
 from pipelines.progress import Progress, ProgressKind, make_progress
 from pipelines.rendering.backend import load_mitsuba
-from pipelines.rendering.contact import write_contact_sheet
+from pipelines.rendering.contact import load_pillow, write_contact_sheet
 from pipelines.rendering.file_scene import FileTracer
 from pipelines.rendering.layouts import LAYOUTS
 from pipelines.rendering.output import example_files, write_example
@@ -56,9 +56,10 @@ def example_stem(outdir: Path, seed: int) -> Path:
 
 def render_example(seed: int, settings: RenderSettings, scene: Path | None = None, threads: int = 0) -> Shot:
     """One example in memory. Raises RendererMissingError, and InputError for a scene file that cannot be used."""
-    if scene is not None:
-        return take_shot(lambda rng: _file_tracer(scene, threads), seed, settings)
-    return take_shot(partial(_random_stage, seed, settings.layout, threads), seed, settings)
+    if scene is None:
+        return take_shot(partial(_random_stage, seed, settings.layout, threads), seed, settings)
+    shot = take_shot(lambda rng: _file_tracer(scene, threads), seed, settings)
+    return replace(shot, about=shot.about | {"scene": scene.name})
 
 
 @lru_cache(maxsize=1)
@@ -107,8 +108,8 @@ def render_scenes(options: RenderOptions, progress_kind: ProgressKind = "auto",
         if len(missing) < len(seeds):
             progress.note(f"{len(seeds) - len(missing)} of {len(seeds)} examples are there already")
         here = partial(render_and_write, options)
-        several = options.workers > 1 and len(missing) > 1
-        with worker_pool(options.workers, here, missing) if several else nullcontext(here) as render:
+        workers = min(options.workers, len(missing))
+        with worker_pool(workers, here, missing) if workers > 1 else nullcontext(here) as render:
             def work(seed: int, progress: Progress) -> str:
                 line = render(seed)
                 (report or progress.note)(line)
@@ -123,10 +124,14 @@ def render_scenes(options: RenderOptions, progress_kind: ProgressKind = "auto",
 
 def _check(options: RenderOptions) -> None:
     load_mitsuba(threads_per_worker(options) if options.workers <= 1 else 1)
-    if options.scene is not None and not options.scene.is_file():
-        raise InputError(f"{options.scene}: no such scene file")
+    if options.contact_sheet:
+        load_pillow()
     if options.settings.size % 4 or options.settings.size < 16:
         raise UsageError(f"a size of {options.settings.size} pixels: give a multiple of 4, at least 16")
+    if options.scene is not None and options.settings.layout is not None:
+        raise UsageError("--layout chooses among the random scenes, which --scene replaces: give one of the two")
+    if options.scene is not None and not options.scene.is_file():
+        raise InputError(f"{options.scene}: no such scene file")
     if options.settings.layout not in (None, *LAYOUTS):
         raise UsageError(f"no layout {options.settings.layout!r}; there are {', '.join(LAYOUTS)}")
     if options.outdir.exists() and not options.outdir.is_dir():
@@ -139,7 +144,11 @@ def _is_complete(options: RenderOptions, seed: int) -> bool:
     *_, about_path = files = example_files(example_stem(options.outdir, seed))
     if not all(path.exists() for path in files):
         return False
-    about: dict[str, Any] = json.loads(about_path.read_text())
-    if about.get("settings") != asdict(options.settings):
+    try:
+        about: dict[str, Any] = json.loads(about_path.read_text())
+        rendered = about.get("scene"), about.get("settings")
+    except (ValueError, AttributeError) as error:
+        raise InputError(f"{about_path}: is not an example's JSON; delete it to render the example again") from error
+    if rendered != (options.scene and options.scene.name, asdict(options.settings)):
         raise UsageError(f"{about_path}: was rendered with other settings; choose another folder or other seeds")
     return True

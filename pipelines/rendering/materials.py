@@ -114,6 +114,8 @@ def bsdf_dict(mi: Any, material: Material) -> dict[str, Any]:
             return {"type": "mask", "opacity": bitmap(opacity),
                     "nested": {"type": "twosided", "inner": {"type": "diffuse",
                                                              "reflectance": bitmap(material.texture)}}}
+        case "light":
+            inner = {"type": "diffuse", "reflectance": bitmap(np.zeros_like(grey))}
         case _:
             inner = {"type": "diffuse", "reflectance": bitmap(material.texture)}
     return {"type": "twosided", "inner": inner}

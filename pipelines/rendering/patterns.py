@@ -1,6 +1,6 @@
 """The numbers that start a path: subpixel position, lens, time. Independent or stratified, one row per pixel.
 
-Mean time is exactly 0.5 in every pixel, and the order of a pixel's samples is shuffled, so that any subset is fair.
+Times are spread evenly over the shutter, and the order of a pixel's samples is shuffled, so that any subset is fair.
 """
 
 from __future__ import annotations
@@ -42,15 +42,16 @@ def _shuffled_strata(rng: np.random.Generator, shape: tuple[int, int]) -> Array:
 
 
 def _square(rng: np.random.Generator, shape: tuple[int, int], stratified: bool) -> tuple[Array, Array]:
-    """Two coordinates per sample; stratified ones are correlated multi-jittered in the sense of Latin hypercubes."""
+    """Two coordinates per sample; stratified ones form Latin hypercubes: each coordinate has one value per stratum."""
     if stratified:
         return _shuffled_strata(rng, shape), _shuffled_strata(rng, shape)
     return rng.random(shape, np.float32), rng.random(shape, np.float32)
 
 
 def shutter_times(rng: np.random.Generator, shape: tuple[int, int], bins: int | None) -> Array:
-    """Times (P,S) in 0..1, stratified in mirrored pairs: the mean is 0.5 in every row.
+    """Times (P,S), uniform in 0..1 and stratified in mirrored pairs: with an even S, the mean is 0.5 in every row.
 
+    An odd sample falls anywhere in the stratum it has: the middle one, or with `bins` the whole shutter.
     With `bins` every time is the centre of one of `bins` equal intervals, all used equally often when S is a multiple
     of `bins`; otherwise the left-over samples take a random mirrored choice of bins.
     """
@@ -58,7 +59,7 @@ def shutter_times(rng: np.random.Generator, shape: tuple[int, int], bins: int | 
     if bins is None:
         half = samples // 2
         early = (np.arange(half) + rng.random((pixels, half), np.float32)) / max(samples, 1)
-        middle = np.full((pixels, samples % 2), 0.5)
+        middle = (half + rng.random((pixels, samples % 2), np.float32)) / max(samples, 1)
         return np.concatenate([early, middle, 1 - early], 1).astype(np.float32)
     whole, rest = divmod(samples, bins)
     index = np.broadcast_to(np.tile(np.arange(bins), whole), (pixels, whole * bins))
@@ -66,8 +67,7 @@ def shutter_times(rng: np.random.Generator, shape: tuple[int, int], bins: int | 
         first = np.argsort(rng.random((pixels, bins // 2), np.float32), axis=1)[:, :rest // 2]
         index = np.concatenate([index, first, bins - 1 - first], 1)
         if rest % 2:
-            # No bin is centred on 0.5, so an odd sample takes either middle bin.
-            index = np.concatenate([index, bins // 2 - rng.integers(0, 2, (pixels, 1))], 1)
+            index = np.concatenate([index, rng.integers(0, bins, (pixels, 1))], 1)
     return ((index + 0.5) / bins).astype(np.float32)
 
 

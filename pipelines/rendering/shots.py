@@ -1,21 +1,22 @@
 """One training example: a random view of a random scene, its path samples and an independent reference.
 
-A cheap pilot picture turns down scenes that are black, flat, without noise or nothing but noise.
+A cheap pilot picture turns down scenes that are black, flat, all but free of noise, or nothing but noise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from deep_io.flat import HALF_MAX
 from model.metrics import EPSILON, common_scale, score
 from pipelines.rendering.patterns import join, make_pattern, shuffle_order
 from pipelines.rendering.tracer import EMISSION, TIME_BINS, SceneTracer
-from pipelines.rendering.views import View, add_camera_motion, add_defocus, choose_view, draw_object_motions
+from pipelines.rendering.views import COC_RANGE, View, add_camera_motion, add_defocus, choose_view, draw_object_motions
 
 Array = npt.NDArray[np.float32]
 
@@ -27,9 +28,13 @@ ATTEMPTS = 12
 CLAMP = (60.0, 240.0)
 EMISSION_CLAMP = 1e4
 BRIGHTNESS_STOPS = 1.5  # standard deviation
-# relMSE of eight samples, estimated from a pilot: easier scenes teach little, harder ones are noise alone.
-EASIEST, EASY, HARDEST = 0.03, 0.12, 1.2
-EASY_KEPT = 0.5
+# relMSE of eight samples, estimated from a pilot. Scenes harder than HARDEST are noise alone, and at EASIEST there is
+# nothing left to learn but to leave the picture as it is. What lies between is kept nearly as it comes: networks that
+# saw few scenes under EASY were up to twice as far from the best on input of little noise, where detail counts most.
+EASIEST, EASY, HARDEST = 0.006, 0.12, 1.2
+EASY_KEPT = 0.85
+# The 95th percentile of |coc| in pixels: more than was asked for means that the lens reaches into a wall beside it.
+WIDEST_BLUR = 1.5 * COC_RANGE[1]
 LIT, CONTRAST = 0.75, 0.08  # least share of surfaces that any path lights, least deviation of log brightness
 PILOT, PILOT_SAMPLES = 64, 16
 
@@ -76,7 +81,7 @@ def take_shot(load: Callable[[np.random.Generator], SceneTracer], seed: int, set
             view = choose_view(tracer, rng, settings.size)
             view = add_defocus(view, rng) if _decide(settings.defocus, DEFOCUS_SHARE, rng) else view
             black = bool(rng.random() < BLACK_SHARE)
-            if attempt < ATTEMPTS - 1 and not _worth(tracer, view, black, rng):
+            if attempt < ATTEMPTS - 1 and not is_worth_rendering(tracer, view, black, rng):
                 continue
             view = _add_motion(tracer, view, rng) if _decide(settings.motion, MOTION_SHARE, rng) else view
             shot = _expose(tracer, view, black, rng, settings)
@@ -104,10 +109,12 @@ def estimated_noise(radiance: Array, samples: int = 8) -> float:
     return float((variance / samples / (rough**2 + EPSILON)).mean())
 
 
-def _worth(tracer: SceneTracer, view: View, black: bool, rng: np.random.Generator) -> bool:
+def is_worth_rendering(tracer: SceneTracer, view: View, black: bool, rng: np.random.Generator) -> bool:
     """Whether a scene teaches, by a small still picture."""
     pattern = make_pattern(rng, PILOT**2, PILOT_SAMPLES, False, None)
-    channels = tracer.trace(view.camera.resized(PILOT), pattern, int(rng.integers(2**31)), features="coverage")
+    channels = tracer.trace(view.camera.resized(PILOT), pattern, int(rng.integers(2**31)))
+    if _percentile_95(channels, np.abs(channels["coc"])) * view.camera.size / PILOT > WIDEST_BLUR:
+        return False
     _clean(channels, black)
     radiance = _stack(channels, PILOT_SAMPLES)
     hit = channels["A"].reshape(-1, PILOT_SAMPLES).any(1)
@@ -138,19 +145,17 @@ def _expose(tracer: SceneTracer, view: View, black: bool, rng: np.random.Generat
     channels, passes = _trace(tracer, view, stratified, rng, settings)
     order = shuffle_order(rng, size**2, n)
     channels = {name: values[order] for name, values in channels.items()}
-    broken = _clean(channels, black) + sum(_clean(part, black) for part in passes)
-    noisy = _stack(channels, n).mean(1).reshape(size, size, 3)
-    scale = _exposure(noisy)
+    broken = _clean(channels, black)
+    scale = _exposure(_stack(channels, n).mean(1).reshape(size, size, 3))
     brightness = float(np.exp2(rng.normal(0, BRIGHTNESS_STOPS)))
     limit = float(np.exp(rng.uniform(*np.log(CLAMP))))
-    for part in (channels, *passes):
-        for c, name in zip("RGB", EMISSION, strict=True):
-            emitted = part.pop(name)
-            scattered = np.minimum((part[c] - emitted) * scale, limit)
-            part[c] = ((np.minimum(emitted * scale, EMISSION_CLAMP) + scattered) * brightness).astype(np.float32)
-    means = [np.stack([part[c].reshape(size, size, -1).mean(2, dtype=np.float64) for c in "RGBA"], -1)
-             for part in passes]
-    reference = np.mean(means, 0).astype(np.float32)
+    scale_and_cut(channels, scale, limit, brightness)
+    total = np.zeros((size, size, 4))
+    for part in passes:
+        broken += _clean(part, black)
+        scale_and_cut(part, scale, limit, brightness)
+        total += np.stack([part[c].reshape(size, size, -1).sum(2, dtype=np.float64) for c in "RGBA"], -1)
+    reference = (total / settings.reference).astype(np.float32)
     about = tracer.describe() | {
         "settings": asdict(settings), "defocus": view.defocus, "camera_motion": view.camera_motion,
         "object_motion": view.object_motion, "stratified": stratified, "black_background": black,
@@ -158,9 +163,24 @@ def _expose(tracer: SceneTracer, view: View, black: bool, rng: np.random.Generat
     return Shot(channels, reference, about)
 
 
+def scale_and_cut(channels: dict[str, Array], scale: float, limit: float, brightness: float) -> None:
+    """Bring R, G, B to the example's brightness, in place: scattered light and emission each up to its own limit.
+
+    Both end at the most that half holds, which is how samples are stored; the reference is no brighter.
+    """
+    for c, name in zip("RGB", EMISSION, strict=True):
+        emitted = channels.pop(name)
+        scattered = np.minimum((channels[c] - emitted) * scale, limit)
+        light = (np.minimum(emitted * scale, EMISSION_CLAMP) + scattered) * brightness
+        channels[c] = np.minimum(light, HALF_MAX).astype(np.float32)
+
+
 def _trace(tracer: SceneTracer, view: View, stratified: bool, rng: np.random.Generator,
-           settings: RenderSettings) -> tuple[dict[str, Array], list[dict[str, Array]]]:
-    """The samples' channels and, for each pass of the reference, its R, G, B and A; all (N,), pixel-major."""
+           settings: RenderSettings) -> tuple[dict[str, Array], Iterator[dict[str, Array]]]:
+    """The samples' channels and, pass by pass as they are traced, the reference's R, G, B, EMISSION and A.
+
+    All are (N,), pixel-major.
+    """
     pixels, n, reference = settings.size**2, settings.samples, settings.reference
     bins = TIME_BINS if tracer.moving else None
     seeds = [int(s) for s in rng.integers(2**31, size=2)]
@@ -171,13 +191,12 @@ def _trace(tracer: SceneTracer, view: View, stratified: bool, rng: np.random.Gen
         both = tracer.trace(view.camera, join(pattern, target), seeds[0])
         tables = {name: values.reshape(pixels, -1) for name, values in both.items()}
         return ({name: table[:, :n].ravel() for name, table in tables.items()},
-                [{name: tables[name][:, n:].ravel() for name in ("R", "G", "B", "A", *EMISSION)}])
-    channels = tracer.trace(view.camera, pattern, seeds[0], stratified)
+                iter([{name: tables[name][:, n:].ravel() for name in ("R", "G", "B", "A", *EMISSION)}]))
     count = max(1, round(reference / (JOINT_REFERENCE if tracer.moving else REFERENCE_PASS)))
     shares = [reference // count + (k < reference % count) for k in range(count)]
-    parts = [tracer.trace(view.camera, make_pattern(rng, pixels, share, stratified, bins), seeds[1] + k, stratified,
-                          "coverage") for k, share in enumerate(shares)]
-    return channels, parts
+    passes = (tracer.trace(view.camera, make_pattern(rng, pixels, share, stratified, bins), seeds[1] + k, stratified,
+                           "coverage") for k, share in enumerate(shares))
+    return tracer.trace(view.camera, pattern, seeds[0], stratified), passes
 
 
 def _exposure(image: Array) -> float:
@@ -207,15 +226,16 @@ def _clean(channels: dict[str, Array], black: bool) -> int:
 def _measure(channels: dict[str, Array], reference: Array, samples: int) -> dict[str, float]:
     """How hard the example is: errors of its first eight samples, and how far it is blurred."""
     radiance, target = _stack(channels, samples), reference[..., :3]
-    hit = channels["A"] > 0
-
-    def percentile_95(values: Array) -> float:
-        return float(np.quantile(values[hit], 0.95)) if hit.any() else 0.0
-
-    about = {"coverage": float(hit.mean()), "coc_95": percentile_95(np.abs(channels["coc"])),
-             "motion_95": percentile_95(np.hypot(channels["motion.X"], channels["motion.Y"])),
+    about = {"coverage": float((channels["A"] > 0).mean()), "coc_95": _percentile_95(channels, np.abs(channels["coc"])),
+             "motion_95": _percentile_95(channels, np.hypot(channels["motion.X"], channels["motion.Y"])),
              "energy": float(radiance.mean() / max(float(target.mean()), 1e-12))}
     if float(np.percentile(target, 99)) > 0:
         noisy = score(radiance[:, :8].mean(1).reshape(target.shape), target, with_flip=False)
         about |= {"relmse8": noisy.relmse, "relmse8_trimmed": noisy.relmse_trimmed, "smape8": noisy.smape}
     return about
+
+
+def _percentile_95(channels: dict[str, Array], values: Array) -> float:
+    """Of the samples that hit something; 0 where none does."""
+    hit = channels["A"] > 0
+    return float(np.quantile(values[hit], 0.95)) if hit.any() else 0.0

@@ -24,9 +24,10 @@ Array = npt.NDArray[np.float32]
 Vector = npt.NDArray[np.float64]
 
 TIME_BINS = 16
-MAX_DEPTH = 5  # a sixth cheaper than six, and hardly darker
+MAX_DEPTH = 5  # segments, so four bounces: a sixth cheaper than six, and hardly darker
 NO_ROULETTE = 1000
-CUTOUT_STEPS = 4  # transparent surfaces a camera ray may cross before it counts as having missed
+# Transparent surfaces that a camera ray may cross; the next one counts as hit. The path itself reaches no further.
+CUTOUT_STEPS = MAX_DEPTH - 1
 MISS_DEPTH = 1e10
 MOTION_LIMIT = 512.0  # pixels; points that cross the camera plane project to infinity
 # Paths per launch: enough to fill many cores, about 1 GB; 32 samples of 192 x 192 pixels fit.

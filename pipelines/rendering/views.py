@@ -71,14 +71,15 @@ def add_defocus(view: View, rng: np.random.Generator) -> View:
 
 
 def add_camera_motion(view: View, rng: np.random.Generator) -> View:
-    """Move and turn the camera so that the middle of the scene moves by CAMERA_MOTION_RANGE."""
+    """Move and turn the camera so that what is at middling depth moves by CAMERA_MOTION_RANGE, roll apart."""
     camera, depth = view.camera, float(np.median(view.depths))
     pixels = log_uniform(rng, CAMERA_MOTION_RANGE)
     angle, share = rng.uniform(0, 2 * np.pi), rng.uniform()
     along = np.cos(angle) * camera.right + np.sin(angle) * camera.up
     metres = pixels * depth / camera.focal
     shift = along * share * metres + camera.forward * rng.normal() * 0.1 * metres
-    turn = np.cross(along, camera.forward) * (1 - share) * pixels / camera.focal
+    # Toward `along` as well: the picture moves the same way by both, or they would cancel.
+    turn = np.cross(camera.forward, along) * (1 - share) * pixels / camera.focal
     turn = turn + camera.forward * rng.normal() * pixels / camera.size
     return replace(view, camera=replace(camera, shift=shift, turn=turn), camera_motion=True)
 

@@ -1,4 +1,4 @@
-"""`lbmc render` with workers, as a user runs it: whatever ends the command ends them, too, leaving no part of a file."""
+"""`lbmc render` with workers, as a user runs it: what ends the command ends them, too, and leaves no part of a file."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +15,18 @@ pytest.importorskip("mitsuba")
 
 from deep_io import read_deep
 from deep_io.errors import InputError, UsageError
-from deep_io.flat import read_flat
+from deep_io.flat import HALF_MAX, read_flat
 from pipelines.rendering import environment
 from pipelines.rendering import geometry as g
 from pipelines.rendering.camera import Camera
+from pipelines.rendering.file_scene import FileTracer
 from pipelines.rendering.job import RenderOptions, render_example, render_scenes
 from pipelines.rendering.patterns import make_pattern
-from pipelines.rendering.shots import RenderSettings, estimated_noise
+from pipelines.rendering.shots import RenderSettings, estimated_noise, is_worth_rendering, scale_and_cut
 from pipelines.rendering.stage import Stage
 from pipelines.rendering.stage_scene import StageTracer
 from pipelines.rendering.tracer import MISS_DEPTH, TIME_BINS, Motion
+from pipelines.rendering.views import CAMERA_MOTION_RANGE, View, add_camera_motion
 from tests.runner import in_process
 
 Array = npt.NDArray[np.float32]
@@ -190,6 +193,53 @@ def test_defocus_and_motion_can_be_forced_and_forbidden() -> None:
     assert moved.about["motion_95"] > 0.2
 
 
+def test_a_moving_camera_moves_the_middle_of_the_scene_by_the_pixels_asked_for() -> None:
+    camera = Camera.look_at([0, 0, 3], [0, 0, 0], 30).resized(SIZE)
+    tracer = StageTracer(wall_stage(), threads=1)
+    pattern = make_pattern(np.random.default_rng(0), SIZE**2, 1, False, None)
+    for seed in range(12):
+        view = add_camera_motion(View(camera, np.array([3.0], np.float32)), np.random.default_rng(seed))
+        channels = tracer.trace(view.camera, pattern, 1)
+        moved = float(np.median(np.hypot(channels["motion.X"], channels["motion.Y"])))
+        assert CAMERA_MOTION_RANGE[0] * 0.9 < moved < CAMERA_MOTION_RANGE[1] * 1.3, seed
+    tracer.close()
+
+
+def test_lights_shine_and_reflect_nothing() -> None:
+    stage = Stage(np.random.default_rng(0))
+    side = 2 * HALF_WIDTH
+    stage.add(g.quad([-HALF_WIDTH, -HALF_WIDTH, 0], [side, 0, 0], [0, side, 0]), stage.light([1.0, 2.0, 3.0]))
+    stage.environment = environment.uniform(np.random.default_rng(0), 1.0)
+    stage.camera = lambda rng: Camera.look_at([0, 0, 3], [0, 0, 0], 30)
+    channels, _, _ = trace(stage, Camera.look_at([0, 0, 3], [0, 0, 0], 30).resized(SIZE), 2)
+    for name, value in {"R": 1.0, "G": 2.0, "B": 3.0, "albedo.R": 0.0}.items():
+        np.testing.assert_allclose(channels[name], value, rtol=1e-5)
+
+
+def test_samples_and_reference_are_cut_alike_and_within_half() -> None:
+    """Else a lamp would be brighter in the reference, which is stored as float, than in any sample."""
+    light = {"R": [1e9, 30.0, 3.0], "G": [1e9, 30.0, 3.0], "B": [1e9, 30.0, 3.0]}
+    emission = {f"emission.{c}": [1e9, 0.0, 1.0] for c in "RGB"}
+    channels = {name: np.array(values, np.float32) for name, values in (light | emission).items()}
+    scale_and_cut(channels, 2.0, 50.0, 8.0)
+    for c in "RGB":
+        np.testing.assert_allclose(channels[c], [HALF_MAX, 50.0 * 8, 3.0 * 2 * 8], rtol=1e-6)
+    assert set(channels) == set("RGB")
+
+
+def test_a_lens_that_reaches_through_things_beside_it_is_turned_down() -> None:
+    stage = busy_stage()
+    # A curtain just outside the picture, which a wide lens sees from both sides.
+    stage.add(g.quad([0.5, 0, 3.4], [0, 0, 1.2], [0, 3, 0]), stage.material("matte", texture=stage.textured("plain")))
+    tracer = StageTracer(stage, threads=1)
+    camera = stage.camera(stage.rng).resized(64)
+    verdicts = [is_worth_rendering(tracer, View(camera.with_lens(coc, 4.0), np.ones(1, np.float32)), False,
+                                   np.random.default_rng(seed)) for coc in (2.0, 600.0) for seed in range(4)]
+    tracer.close()
+    assert any(verdicts[:4])
+    assert not any(verdicts[4:])
+
+
 def test_estimated_noise_is_that_of_fewer_samples() -> None:
     rng = np.random.default_rng(1)
     paths = (0.5 + rng.normal(0, 0.2, (16 * 16, 400, 3))).astype(np.float32)
@@ -239,6 +289,17 @@ def test_other_settings_do_not_mix_with_what_is_there(tmp_path: Path) -> None:
     render_scenes(options(tmp_path, count=1, contact_sheet=False), "none")
     with pytest.raises(UsageError, match="other settings"):
         render_scenes(options(tmp_path, count=1, settings=RenderSettings(8, 4, SIZE, "tabletop")), "none")
+    scene = tmp_path / "room.xml"
+    scene.write_text(SCENE)
+    (tmp_path / "files").mkdir()
+    of_scene = options(tmp_path / "files", count=1, settings=RenderSettings(2, 2, SIZE), contact_sheet=False)
+    render_scenes(of_scene, "none")
+    with pytest.raises(UsageError, match="other settings"):
+        render_scenes(replace(of_scene, scene=scene), "none")
+    about = tmp_path / "files" / "scene000010.json"
+    about.write_text("[]")
+    with pytest.raises(InputError, match="scene000010.json: is not an example's JSON; delete it"):
+        render_scenes(of_scene, "none")
 
 
 def test_workers_give_the_same_examples_as_one_process(tmp_path: Path) -> None:
@@ -268,7 +329,41 @@ def test_a_scene_file_gives_views_with_features_and_motion(tmp_path: Path) -> No
     np.testing.assert_array_equal(shots[0].reference, shots[2].reference)
 
 
+NAMELESS = """<scene version="3.0.0">
+  <sensor type="perspective"><transform name="to_world"><lookat origin="0,1,4" target="0,0.5,0" up="0,1,0"/></transform>
+  </sensor><emitter type="constant"/>
+  <shape type="rectangle"><transform name="to_world"><scale value="4"/><rotate x="1" angle="-90"/></transform></shape>
+  <shape type="obj"><string name="filename" value="sheet.obj"/></shape>
+</scene>
+"""
+GROUPED = """<scene version="3.0.0"><emitter type="constant"/>
+  <shape type="shapegroup" id="group"><shape type="cube"/></shape><shape type="instance"><ref id="group"/></shape>
+</scene>"""
+# A triangle with normals of the modeller's own, which are not those of its face.
+SHEET = "v -0.3 0 0\nv 0.3 0 0\nv 0 0.6 0\nvn 0.5 0 0.866\nf 1//1 2//1 3//1\n"
+
+
+def test_shapes_without_a_name_move_and_keep_their_own_normals(tmp_path: Path) -> None:
+    (tmp_path / "scene.xml").write_text(NAMELESS)
+    (tmp_path / "sheet.obj").write_text(SHEET)
+    tracer = FileTracer(tmp_path / "scene.xml", threads=1)
+    assert len(tracer.movable()) == 1
+    camera = Camera.look_at([0, 0.3, 2], [0, 0.3, 0], 25).resized(SIZE)
+    still, moving = (make_pattern(np.random.default_rng(1), SIZE**2, TIME_BINS, False, bins)
+                     for bins in (None, TIME_BINS))
+    before = tracer.trace(camera, still, 1)
+    tracer.set_motions({number: Motion(np.array([0.2, 0.0, 0.0]), np.zeros(3), centre)
+                        for number, centre in tracer.movable().items()})
+    assert np.quantile(tracer.trace(camera, moving, 1)["motion.X"], 0.99) > 2
+    tracer.close()
+    after = tracer.trace(camera, still, 1)
+    for name, values in before.items():
+        np.testing.assert_array_equal(values, after[name], err_msg=name)
+    assert np.isclose(before["N.X"], 0.5, atol=0.01).any()
+
+
 @pytest.mark.parametrize(("text", "complaint"), [
+    (GROUPED, "instances"),
     ("<scene version='3.0.0'><shape type='nonsense'/></scene>", "not a scene that Mitsuba can load"),
     ("<scene version='3.0.0'><shape type='sphere'/></scene>", "no lights"),
     ("not XML", "not a scene that Mitsuba can load"),
@@ -294,6 +389,7 @@ def test_the_command_renders_and_reports(tmp_path: Path) -> None:
     (["--layout", "cellar"], 2, "interior"),
     (["--size", 33], 2, "multiple of 4"),
     (["--scene", "nowhere.xml"], 3, "nowhere.xml"),
+    (["--scene", "nowhere.xml", "--layout", "outdoor"], 2, "one of the two"),
 ])
 def test_the_command_refuses_in_one_line(tmp_path: Path, arguments: list[object], code: int, complaint: str) -> None:
     run = in_process("render", tmp_path, "--count", 1, *arguments)

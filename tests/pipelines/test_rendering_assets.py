@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from pipelines.rendering import environment, textures
 from pipelines.rendering.backend import OLDEST_LLVM, RendererMissingError, find_llvm, llvm_version
 from pipelines.rendering.camera import Camera
-from pipelines.rendering.geometry import box, random_rotation, superellipsoid, tube
+from pipelines.rendering.geometry import box, lathe, random_rotation, superellipsoid, torus, tube
+from pipelines.rendering.interiors import glowing_window
 from pipelines.rendering.layouts import LAYOUTS
 from pipelines.rendering.materials import QUOTAS, SLOT_KINDS
 from pipelines.rendering.patterns import concentric_disk, join, make_pattern, shuffle_order, shutter_times
@@ -77,9 +78,26 @@ def test_a_kind_of_material_never_takes_more_slots_than_it_has() -> None:
 
 def test_solids_face_outwards() -> None:
     """The signed volume of a closed mesh is positive when its faces turn counter-clockwise seen from outside."""
-    for mesh, volume in ((box([1, 2, 3]), 6.0), (superellipsoid([2, 2, 2], 1.0, 64), 4 / 3 * np.pi)):
+    straight = np.linspace([0, 0, 0], [1, 0, 0], 9)
+    for mesh, volume in (
+            (box([1, 2, 3]), 6.0), (superellipsoid([2, 2, 2], 1.0, 64), 4 / 3 * np.pi),
+            (torus(1.0, 0.2, 256, 128), 2 * np.pi**2 * 0.04), (tube(straight, 0.1, 128), 2 / 3 * np.pi * 0.01),
+            (lathe([[0, 0], [0.5, 0], [0.5, 1], [0, 1]], 128), np.pi / 4)):
         a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+        # Seen from the origin, the open ends of the tube take a third of its volume away.
         assert float((a * np.cross(b, c)).sum()) / 6 == pytest.approx(volume, rel=0.01)
+
+
+def test_the_panel_outside_a_window_shines_into_the_room() -> None:
+    for along, inward in (([1.0, 0, 0], [0, 0, 1.0]), ([0, 0, 1.0], [-1.0, 0, 0]), ([-1.0, 0, 0], [0, 0, -1.0])):
+        stage = Stage(np.random.default_rng(1))
+        glowing_window(stage, np.zeros(3), np.array(along), np.array(inward), (1.0, 1.0, 2.0, 2.0))
+        mesh = stage.placed[0].mesh
+        for face in mesh.faces:
+            a, b, c = mesh.vertices[face]
+            # An area light shines on the side from which its faces turn counter-clockwise.
+            assert np.cross(b - a, c - a) @ inward > 0
+        assert ((mesh.vertices @ inward) < 0).all(), "it hangs outside"
 
 
 def test_a_tube_keeps_its_distance_from_its_path() -> None:
@@ -107,8 +125,8 @@ def test_mean_time_is_the_middle_of_the_shutter(samples: int, bins: int | None, 
     assert pattern.time.shape == (12, samples)
     assert pattern.time.min() >= 0
     assert pattern.time.max() <= 1
-    # An odd sample cannot sit on 0.5 where bins have no centre there.
-    slack = 0.5 / TIME_BINS / samples if bins and samples % 2 else 0
+    # An odd sample is a draw from its stratum, or from the whole shutter where that has bins.
+    slack = 0.5 / samples / (1 if bins else samples) if samples % 2 else 0
     assert np.abs(pattern.time.mean(1) - 0.5).max() <= slack + 1e-6
     assert np.hypot(pattern.lens_x, pattern.lens_y).max() <= 1 + 1e-6
 
@@ -117,6 +135,17 @@ def test_whole_sets_of_samples_use_every_time_bin_equally() -> None:
     time = shutter_times(np.random.default_rng(2), (5, 3 * TIME_BINS), TIME_BINS)
     counts = np.stack([np.bincount((row * TIME_BINS).astype(int), minlength=TIME_BINS) for row in time])
     assert (counts == 3).all()
+
+
+@pytest.mark.parametrize("bins", [None, TIME_BINS])
+@pytest.mark.parametrize("samples", [1, 3, 4, 21])
+def test_any_number_of_samples_is_spread_evenly_over_the_shutter(samples: int, bins: int | None) -> None:
+    """So that few samples and the many of a reference show the same blur."""
+    pixels = 4000
+    time = shutter_times(np.random.default_rng(3), (pixels, samples), bins)
+    counts = np.bincount((time.ravel() * TIME_BINS).astype(int), minlength=TIME_BINS)
+    expected = pixels * samples / TIME_BINS
+    assert np.abs(counts - expected).max() < 5 * np.sqrt(expected)
 
 
 def test_stratified_patterns_put_one_sample_in_every_stratum() -> None:
