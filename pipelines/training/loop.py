@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from deep_io.errors import LbmcError
 from model.compositing import Layers
 from model.config import Config
 from model.denoiser import Denoiser
@@ -31,6 +32,7 @@ from pipelines.training.validation import UNIT, validate
 TIME_IS_UP = 1  # below the numbers of the signals that end a run
 GUARDED = 1 / 3  # of the run, in which the guard against a collapsed partition fades
 ORDER_MARGIN = 0.02  # log units of depth by which a layer should be behind the one in front of it
+HOPELESS = 40  # steps in a row whose gradient is not finite: the weights have diverged, and would not change again
 BETAS = (0.9, 0.99)  # of Adam; steps are few and batches small, so its variance must not lag by a thousand steps
 
 Report = Callable[[str], None]
@@ -125,7 +127,8 @@ class Trainer:
         """Trains until `recipe.steps` or for `seconds`; validates by the recipe, saves then and every so many seconds.
 
         SIGINT and SIGTERM end the run after the step they came in: raises StoppedError, once the checkpoint is
-        written. Whatever else ends it, the checkpoint is that of the last whole step. `loaders` threads make batches.
+        written. Raises LbmcError where training has diverged. Whatever ends it, the checkpoint is that of the last
+        whole step. `loaders` threads make batches.
         """
         begun = saved = time.monotonic()
         stop = 0
@@ -139,6 +142,7 @@ class Trainer:
                     if stop or self.step >= self.recipe.steps:
                         break
                     self.advance(next(batches))
+                    self._refuse_to_go_on_for_nothing()
                     if time.monotonic() - saved >= save_every:
                         self.save()
                         saved = time.monotonic()
@@ -167,6 +171,13 @@ class Trainer:
             yield stream()
         finally:
             pool.shutdown(cancel_futures=True)
+
+    def _refuse_to_go_on_for_nothing(self) -> None:
+        """Raises LbmcError where no step has had a finite gradient for long. All processes see the same losses."""
+        last = self.state.losses[-HOPELESS:]
+        if len(last) == HOPELESS and not np.isfinite(last).any():
+            raise LbmcError(f"step {self.step}: the last {HOPELESS} gradients were not finite, the weights have "
+                            f"diverged; train anew with a lower --learning-rate")
 
     def _due(self) -> bool:
         """Whether the curve lacks the row of this step."""

@@ -16,7 +16,7 @@ import pytest
 import torch
 from PIL import Image
 
-from deep_io.errors import InputError, UsageError
+from deep_io.errors import InputError, LbmcError, UsageError
 from model import zoo
 from model.compositing import Layers, to_layers
 from model.denoiser import Denoiser
@@ -29,7 +29,7 @@ from pipelines.training.caching import build_cache
 from pipelines.training.drawing import PANEL_PIXELS, curve_png, panel_png
 from pipelines.training.group import ALONE, Group
 from pipelines.training.job import TrainOptions, starting_weights, train
-from pipelines.training.loop import Trainer, disorder, learning_rate
+from pipelines.training.loop import HOPELESS, Trainer, disorder, learning_rate
 from pipelines.training.recipe import Augmentation, Recipe
 from pipelines.training.run_folder import CHECKPOINT, CURVE, CURVE_PICTURE, PANELS, RECIPE
 from pipelines.training.validation import pixel_means, validate
@@ -227,6 +227,19 @@ def test_a_step_that_is_not_finite_is_skipped_and_counted(cache: SampleCache, tm
     trainer.run(cache, cache, told.append)
     assert trainer.state.rows[-1]["skipped"] == 1
     assert "1 steps skipped" in told[-1]
+
+
+def test_a_run_that_has_diverged_ends_in_one_line(
+    cache: SampleCache, tmp_path: Path
+) -> None:
+    recipe = dataclasses.replace(QUICK, steps=HOPELESS + 5, validate_every=1000)
+    trainer = Trainer(SMALL, recipe, tmp_path)
+    with torch.no_grad():
+        for parameter in trainer.net.parameters():
+            parameter.fill_(torch.nan)
+    with pytest.raises(LbmcError, match=f"step {HOPELESS}: .* lower --learning-rate"):
+        trainer.run(cache, cache, print)
+    assert (tmp_path / CHECKPOINT).exists()
 
 
 def test_validation_scores_output_and_input_against_the_reference(cache: SampleCache) -> None:
