@@ -158,6 +158,17 @@ def decode_block(counts: NDArray[np.int32], channels: dict[str, NDArray[np.gener
                        extra, decoded.order)
 
 
+def radiance_values(stored: NDArray[np.generic]) -> tuple[Values, NDArray[np.bool_]]:
+    """A channel of light in float32 with half's overflows at half's largest value, and which values are light at all.
+
+    Those that are not are NaN, -Inf, in a float channel Inf, and magnitudes beyond LARGEST_RADIANCE.
+    """
+    values = stored.astype(np.float32)
+    if stored.dtype == np.float16:
+        values[np.isposinf(values)] = _LARGEST_HALF
+    return values, _within(values, LARGEST_RADIANCE)
+
+
 def _carried(names: tuple[str, ...], channels: Mapping[str, NDArray[np.generic]], repairs: Counter[str]) -> Values:
     """(N, len(names)) float32 of channels, sound: an overflow of half is its largest value, the rest becomes 0."""
     columns = []
@@ -165,8 +176,8 @@ def _carried(names: tuple[str, ...], channels: Mapping[str, NDArray[np.generic]]
         values = channels[name].astype(np.float32)
         if not _all_within(values, LARGEST_RADIANCE):
             repairs[name] += int((~_within(values, LARGEST_RADIANCE)).sum())
-            values[np.isposinf(values) & (channels[name].dtype == np.float16)] = _LARGEST_HALF
-            values[~_within(values, LARGEST_RADIANCE)] = 0
+            values, sound = radiance_values(channels[name])
+            values[~sound] = 0
         columns.append(values)
     return np.stack(columns, axis=1) if columns else np.empty((0, 0), np.float32)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save as serialize
 
 from model.config import Config
 from model.denoiser import Denoiser
@@ -70,7 +70,9 @@ def list_models() -> list[Weights]:
 
 
 def save(net: Denoiser, path: Path, info: dict[str, Any]) -> None:
-    """Writes a weight file. Its bytes depend on the weights, the config and `info` alone."""
+    """Writes a weight file. Its bytes depend on the weights, the config and `info` alone; its permissions on the umask,
+    or on the file that is replaced."""
     document = {"format": FORMAT, "config": net.config.to_dict(), "info": info}
     state = {key: value.to(torch.float16).contiguous() for key, value in net.state_dict().items()}
-    save_file(state, path, {METADATA_KEY: json.dumps(document, sort_keys=True)})
+    # As bytes: safetensors' own writing leaves files that nobody but their owner can read.
+    path.write_bytes(serialize(state, {METADATA_KEY: json.dumps(document, sort_keys=True)}))

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_io.attributes import Attribute
+from deep_io.decoding import LARGEST_RADIANCE
 from deep_io.errors import InputError
 from deep_io.flat import FlatImage, read_flat_parts
 from deep_io.header import Header, channels_of
@@ -50,9 +51,9 @@ class RenderStack:
         return DeepSamples(counts, channels, window.rows(y0, y1))
 
     def largest(self, names: Iterable[str]) -> float:
-        """The largest finite magnitude in the named channels."""
+        """The largest magnitude in the named channels of light, what is no light left out."""
         magnitudes = (np.abs(frame[name], dtype=np.float32) for frame in self.frames for name in names)
-        return max(float(np.max(values, initial=0.0, where=np.isfinite(values))) for values in magnitudes)
+        return max(float(np.max(values, initial=0.0, where=values <= LARGEST_RADIANCE)) for values in magnitudes)
 
 
 def read_renders(sources: Sequence[PathLike], overrides: Mapping[str, str] | None = None,

@@ -18,9 +18,9 @@ WRITTEN = ("R", "G", "B", "A")  # the beauty's own channels
 
 
 def matching_channels(header: Header, wanted: Sequence[str], source: str) -> list[str]:
-    """Channels that a request names: a channel, a layer (all its channels) or a glob, which passes ids by.
+    """Channels that a request names: a channel, a layer (all its channels) or a glob, which passes ids and WRITTEN by.
 
-    Raises InputError for a request that matches nothing; the message lists what there is.
+    Raises InputError for a request that matches nothing; the message lists what there is. UsageError for WRITTEN.
     """
     names, ids = header.channel_names, id_channels(header)
     found: list[str] = []
@@ -29,6 +29,8 @@ def matching_channels(header: Header, wanted: Sequence[str], source: str) -> lis
                    or (fnmatchcase(name, request) and name not in ids)]
         if not matches:
             raise InputError(f"{source}: no channel or layer {request!r} to keep; there are {', '.join(names)}")
+        if request in WRITTEN:
+            raise UsageError(f"--keep {request}: is the beauty's own channel, written denoised; leave it out of --keep")
         found += [name for name in matches if name not in found and name not in WRITTEN]
     return found
 
@@ -36,8 +38,8 @@ def matching_channels(header: Header, wanted: Sequence[str], source: str) -> lis
 def find_kept(header: Header, weighting: str, wanted: Sequence[str], source: str) -> list[str]:
     """The names of the channels asked for, checked before any work is done.
 
-    Raises InputError for a request that matches nothing or an id (an average of ids is no id), UsageError unless every
-    sample weighs the same.
+    Raises InputError for a request that matches nothing or an id (an average of ids is no id), UsageError for a channel
+    of the beauty's own, and unless every sample weighs the same.
     """
     if not wanted:
         return []

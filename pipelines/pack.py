@@ -19,7 +19,7 @@ from deep_io.aliases import DISTANCE, VIEW, WORLD
 from deep_io.atomic import Existing, atomic_output, output_action
 from deep_io.camera import Camera, parse_camera
 from deep_io.conventions import DEPTH_ATTRIBUTE, NORMALS_ATTRIBUTE, Conventions, resolve
-from deep_io.decoding import Interpretation, path_samples
+from deep_io.decoding import LARGEST_RADIANCE, Interpretation, path_samples, radiance_values
 from deep_io.deep_writer import DeepWriter
 from deep_io.errors import InputError, UsageError
 from deep_io.flat import HALF_MAX, kept_attributes, to_half
@@ -89,8 +89,9 @@ class PackReport:
 
     def lines(self) -> list[str]:
         """The report as text."""
-        mended = [f"{self.target}: {count} samples without finite {role}"
-                  for role, count in sorted(self.repairs.items()) if count]
+        mended = [f"{self.target}: {count} samples " + (
+                      f"left out: their radiance is not finite, or beyond {LARGEST_RADIANCE:g}" if role == "radiance"
+                      else f"without finite {role}") for role, count in sorted(self.repairs.items()) if count]
         return [f"{self.target}: {self.samples} samples per pixel", *self.mapping.lines(), *self.notes, *mended]
 
 
@@ -259,8 +260,9 @@ class _Encoding:
                 for index, name in enumerate(ROLES[role].channels):
                     channels[name] = self._stored(name, values[:, index], packed, role == "radiance")
         for name in self.layer_channels:
-            values = np.asarray(block.channels[name], np.float32)
-            channels[name] = self._stored(name, np.where(np.isfinite(values), values, 0), packed, True)
+            values, sound = radiance_values(block.channels[name])
+            repairs[name] += int(np.count_nonzero(~sound))
+            channels[name] = self._stored(name, np.where(sound, values, 0), packed, True)
         return DeepSamples(block.counts, {name: channels[name] for name in self.types}, block.window)
 
     def _stored(self, name: str, values: NDArray[np.float32], packed: Packed, like_radiance: bool
@@ -271,12 +273,10 @@ class _Encoding:
         return to_half(ordered)[0] if self.types[name] == np.float16 else ordered
 
     def _without_broken(self, block: DeepSamples, repairs: Counter[str]) -> DeepSamples:
-        """The block without samples whose radiance is not finite; +Inf in half is an overflow and stays."""
+        """The block without samples whose radiance denoising would leave out: pixels are the means of the others."""
         whole = np.ones(block.total, bool)
         for name in self.mapping["radiance"].channels:
-            values = np.asarray(block.channels[name], np.float32)
-            overflow = np.isposinf(values) & (block.channels[name].dtype == np.float16)
-            whole &= np.isfinite(values) | overflow
+            whole &= radiance_values(block.channels[name])[1]
         if whole.all():
             return block
         repairs["radiance"] += int(np.count_nonzero(~whole))

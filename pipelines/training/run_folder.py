@@ -117,4 +117,3 @@ class RunFolder:
         """The averaged weights as a weight file that `--model` takes."""
         with atomic_output(target) as path:
             zoo.save(averaged, path, info)
-            path.chmod((self.folder / RECIPE).stat().st_mode & 0o777)  # safetensors writes for the owner alone

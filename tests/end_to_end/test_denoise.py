@@ -228,6 +228,16 @@ def test_a_glob_of_channels_to_keep_passes_ids_by_and_a_name_does_not(weights: P
     assert set(read_flat(tmp_path / "out.exr")[0]) == {"R", "G", "B", "A", "coc"}
 
 
+def test_the_beautys_own_channels_cannot_be_kept_and_globs_pass_them_by(weights: Path, tmp_path: Path) -> None:
+    source, out = write_scene(tmp_path / "in.exr", noisy_scene(0, TINY)), tmp_path / "out.exr"
+    refused = in_process("denoise", source, out, "--model", weights, "--keep", "coc", "--keep", "R")
+    assert refused.code == 2
+    assert "ERROR: --keep R: is the beauty's own channel, written denoised; leave it out of --keep\n" in refused.err
+    assert not out.exists()
+    assert in_process("denoise", source, out, "--model", weights, "--keep", "[Rc]*").code == 0
+    assert {"R", "coc"} < set(read_flat(out)[0])
+
+
 def test_values_beyond_half_are_clamped_counted_and_said(weights: Path, tmp_path: Path) -> None:
     samples = noisy_scene(5, TINY, dtype=np.float32)
     bright = {name: samples.channels[name] * np.float32(1e7) for name in "RGB"}

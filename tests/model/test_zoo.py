@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import stat
 from pathlib import Path
 
 import pytest
@@ -28,6 +30,20 @@ def test_the_bytes_depend_on_the_weights_alone(tmp_path: Path) -> None:
     for name in ("a", "b"):
         zoo.save(random_network(SMALL["fast"], 1, torch.float32), tmp_path / f"{name}.safetensors", {"steps": 1})
     assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
+
+
+def test_saved_weights_have_the_permissions_of_any_other_file(tmp_path: Path) -> None:
+    path = tmp_path / "shared.safetensors"
+    net = random_network(SMALL["fast"], 1, torch.float32)
+    before = os.umask(0o027)
+    try:
+        zoo.save(net, path, {})
+        assert stat.S_IMODE(path.stat().st_mode) == 0o640
+        path.chmod(0o664)
+        zoo.save(net, path, {})
+        assert stat.S_IMODE(path.stat().st_mode) == 0o664, "a file that is replaced stays as open as it was"
+    finally:
+        os.umask(before)
 
 
 def test_what_is_not_ours_is_refused_by_name(tmp_path: Path) -> None:

@@ -225,6 +225,29 @@ def test_samples_of_broken_radiance_are_left_out_and_the_rest_keeps_its_mean(tmp
     np.testing.assert_allclose(flatten(out)["R"][4, 5], expected, rtol=1e-5)
 
 
+def test_radiance_too_large_to_be_light_is_left_out_as_in_denoising(tmp_path):
+    """What uninitialised buffers hold: as finite as it is, the sums of any reader would overflow."""
+    pictures = [render(seed, half=False) for seed in range(3)]
+    for number, picture in enumerate(pictures):
+        picture |= {f"key.{c}": picture[c] / 2 for c in "RGB"}
+        picture["R"][2, 3] = np.finfo(np.float32).max
+        picture["G"][4, 5] = [np.finfo(np.float32).max, 1.0, 2.0][number]
+        picture["key.B"][1, 1] = [-np.finfo(np.float32).max, 1.0, 2.0][number]
+    out = tmp_path / "deep.exr"
+    report = pack(write_renders(tmp_path, pictures), out, PackOptions(layers=("key",)))
+    assert report is not None
+    assert (report.repairs["radiance"], report.repairs["key.B"]) == (4, 1)
+    assert f"{out}: 4 samples left out: their radiance is not finite, or beyond 1e+30" in report.lines()
+    assert not any("beyond the range of half" in note for note in report.notes)
+    samples = read(out)
+    assert (samples.counts[2, 3], samples.counts[4, 5]) == (0, 2)
+    assert not samples.repairs
+    flat = flatten(out)
+    assert all(np.isfinite(values).all() for values in flat.values())
+    np.testing.assert_allclose(flat["G"][4, 5], 1.5, rtol=HALF)
+    np.testing.assert_allclose(flat["key.B"][1, 1], 1.0, rtol=HALF)
+
+
 def test_radiance_beyond_half_is_written_as_float(tmp_path):
     pictures = [render(seed, half=False) for seed in range(2)]
     pictures[0]["R"][5, 5] = 1e6
