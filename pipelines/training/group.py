@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -40,7 +41,11 @@ class Group:
 
     def wrap(self, module: nn.Module) -> nn.Module:
         """The module, with its gradients averaged over the processes."""
-        return module if self.size == 1 else nn.parallel.DistributedDataParallel(module)
+        if self.size == 1:
+            return module
+        # gradients of 1x1 convolutions are laid out otherwise than the buffers; copying the few of them costs nothing
+        warnings.filterwarnings("ignore", message="Grad strides do not match bucket view strides")
+        return nn.parallel.DistributedDataParallel(module)
 
     def mean(self, value: torch.Tensor) -> float:
         """The mean over the processes of a scalar."""
