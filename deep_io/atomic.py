@@ -22,9 +22,11 @@ Existing = Literal["refuse", "overwrite", "skip"]
 MOST_OF_STEM = 40  # characters: a name of the 255 bytes that file systems allow leaves no room for what is added
 
 
-def output_action(target: PathLike, inputs: Iterable[PathLike] = (), existing: Existing = "refuse") -> bool:
+def output_action(target: PathLike, inputs: Iterable[PathLike] = (), existing: Existing = "refuse", *,
+                  can_skip: bool = True) -> bool:
     """Whether `target` is to be written: True, or False where it exists and `existing` is "skip".
 
+    `can_skip` tells whether the job's command has --skip-existing, so that a refusal may advise it.
     Raises UsageError when it is one of `inputs` (the same file, a hard or symbolic link to it), when it exists and
     may not be replaced, and when it is a folder; InputError when its folder does not exist or cannot be written.
     """
@@ -37,7 +39,8 @@ def output_action(target: PathLike, inputs: Iterable[PathLike] = (), existing: E
         if existing == "skip":
             return False
         if existing == "refuse":
-            raise UsageError(f"{path}: exists; pass --overwrite to replace it or --skip-existing to leave it")
+            skip = " or --skip-existing to leave it" if can_skip else ""
+            raise UsageError(f"{path}: exists; pass --overwrite to replace it{skip}")
     return True
 
 

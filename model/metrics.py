@@ -95,6 +95,8 @@ def common_scale(reference: Image) -> float:
     r = np.asarray(reference, dtype=np.float64)
     mean = float(np.minimum(r, np.percentile(r, SCALE_PERCENTILE)).mean())
     if not mean > 0.0:
+        if r.mean() > 0.0:
+            raise ValueError("99 % of the reference's values are black, so there is no scale to measure on")
         raise ValueError(f"the reference has no light in it (mean {mean:g}), so there is no scale to measure on")
     return MID_GREY / mean
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
+from importlib.util import find_spec
 from math import isfinite, isnan
 from pathlib import Path
 from typing import Any
@@ -87,7 +88,7 @@ class CompareOptions:
     other_half: str | None = None
     """`reference` and this are independent renderings of one picture."""
     frames: str | None = None
-    """Fileseq range. None: the frames that both sequences have."""
+    """Fileseq range. None: the frames that all sequences have."""
     heat_map: str | None = None
     """PNG to write; a pattern for sequences."""
     panel: str | None = None
@@ -103,36 +104,60 @@ def compare_frames(options: CompareOptions) -> JobReport[Comparison]:
     fails that frame only; see `compare`.
     """
     frames = _frames(options)
-    pictures: list[tuple[str, Callable[[Comparison], bytes]]] = []
-    for pattern, draw in ((options.heat_map, Comparison.heat_map), (options.panel, Comparison.panel)):
-        if pattern is None:
-            continue
-        pictures.append((pattern, draw))
-        if is_sequence(pattern) != is_sequence(options.image):
-            raise UsageError(f"{pattern}: write one picture per frame, such as error.####.png, for a sequence only")
-        for frame in frames:
-            inputs = [path for path in _inputs(options, frame) if path is not None]
-            output_action(_of_frame(pattern, frame), inputs, "overwrite" if options.overwrite else "refuse")
+    pictures = _pictures(options, frames)
 
     def work(frame: Frame, progress: Progress) -> Comparison:
         comparison = compare(*_inputs(options, frame), with_flip=options.flip)
-        for pattern, draw in pictures:
+        for pattern, draw in pictures.items():
             with atomic_output(_of_frame(pattern, frame)) as path:
                 path.write_bytes(draw(comparison))
         return comparison
 
     with make_progress(options.progress if len(frames) > 1 else "none", len(frames)) as progress:
+        if options.flip and not flip_installed():
+            progress.note("FLIP is left out: flip-evaluator is not installed; pip install 'lbmc[bench]' brings it")
         return run_frames(frames, work, progress)
+
+
+def flip_installed() -> bool:
+    """Whether `flip_evaluator` can be imported."""
+    return find_spec("flip_evaluator") is not None
 
 
 def _frames(options: CompareOptions) -> list[Frame]:
     frames = expand(options.image, options.frames)
-    if options.frames is not None or not is_sequence(options.image):
+    others = [other for other in (options.reference, options.other_half) if other is not None]
+    many = is_sequence(options.image)
+    for other in others:
+        if is_sequence(other):
+            if not many:
+                raise InputError(f"{other}: is a sequence, but {options.image} is a single file; name one frame of it")
+        elif not Path(other).exists():
+            raise InputError(f"{other}: no such file")
+    if options.frames is not None or not many:
         return frames
-    common = [frame for frame in frames if _of_frame(options.reference, frame).is_file()]
+    common = [frame for frame in frames if all(_of_frame(other, frame).is_file() for other in others)]
     if not common:
-        raise InputError(f"{options.image} and {options.reference} have no frame in common")
+        raise InputError(f"{' and '.join([options.image, *others])} have no frame in common")
     return common
+
+
+def _pictures(options: CompareOptions, frames: list[Frame]) -> dict[str, Callable[[Comparison], bytes]]:
+    """What to draw, by the path or pattern it goes to, checked before any work. Raises UsageError."""
+    if options.panel is not None and options.panel == options.heat_map:
+        raise UsageError(f"{options.panel}: is to be both heat map and panel; give each a name of its own")
+    asked = {options.heat_map: Comparison.heat_map, options.panel: Comparison.panel}
+    pictures = {pattern: draw for pattern, draw in asked.items() if pattern is not None}
+    for pattern in pictures:
+        if Path(pattern).suffix.lower() != ".png":
+            raise UsageError(f"{pattern}: a PNG is written; give it a name that ends in .png")
+        if is_sequence(pattern) != is_sequence(options.image):
+            raise UsageError(f"{pattern}: write one picture per frame, such as error.####.png, for a sequence only")
+        for frame in frames:
+            inputs = [path for path in _inputs(options, frame) if path is not None]
+            output_action(_of_frame(pattern, frame), inputs, "overwrite" if options.overwrite else "refuse",
+                          can_skip=False)
+    return pictures
 
 
 def _inputs(options: CompareOptions, frame: Frame) -> tuple[Path, Path, Path | None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -54,16 +55,46 @@ def test_pictures_are_written_and_not_over_others(pair: tuple[Path, Path], tmp_p
     refused = in_process(*words)
     assert refused.code == 2
     assert "--overwrite" in refused.err
+    assert "--skip-existing" not in refused.err  # compare has no such option
     assert heat.stat().st_mtime_ns == before
     assert in_process(*words, "--overwrite").code == 0
     assert heat.stat().st_mtime_ns > before
 
 
-def test_a_picture_never_lands_on_an_input(pair: tuple[Path, Path]) -> None:
+def test_a_picture_never_lands_on_an_input(pair: tuple[Path, Path], tmp_path: Path) -> None:
     before = pair[1].read_bytes()
-    run = in_process("compare", *pair, "--no-flip", "--heatmap", pair[1], "--overwrite")
+    link = tmp_path / "link.png"
+    link.hardlink_to(pair[1])
+    run = in_process("compare", *pair, "--no-flip", "--heatmap", link, "--overwrite")
     assert run.code == 2
+    assert "is the input" in run.err
     assert pair[1].read_bytes() == before
+
+
+def test_two_pictures_need_two_names(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    run = in_process("compare", *pair, "--heatmap", tmp_path / "one.png", "--panel", tmp_path / "one.png")
+    assert run.code == 2
+    assert "one.png" in run.err
+    assert not (tmp_path / "one.png").exists()
+
+
+@pytest.mark.parametrize("name", ["error.jpg", "error", "error.exr"])
+def test_a_picture_is_a_png_by_name_too(pair: tuple[Path, Path], tmp_path: Path, name: str) -> None:
+    run = in_process("compare", *pair, "--panel", tmp_path / name)
+    assert run.code == 2
+    assert f"{name}: a PNG is written" in run.err
+    assert not (tmp_path / name).exists()
+
+
+def test_without_flip_evaluator_it_is_said_what_is_missing(
+    pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    run = in_process("compare", *pair)
+    assert run.code == 0
+    assert "FLIP" not in run.out
+    assert "pip install 'lbmc[bench]'" in run.err
+    assert in_process("compare", *pair, "--no-flip").err == ""
 
 
 @pytest.fixture
@@ -100,6 +131,20 @@ def test_one_reference_serves_a_whole_sequence(sequences: Path) -> None:
     assert len(json.loads(run.out)["images"]) == 4
 
 
+def test_both_halves_of_a_frame_are_needed(sequences: Path) -> None:
+    write_flat(sequences / "half.1003.exr", picture(7))
+    words = ("compare", sequences / "image.####.exr", sequences / "reference.####.exr", "--no-flip", "--other-half")
+    run = in_process(*words, sequences / "half.####.exr", "--json")
+    assert run.code == 0, run.err
+    (found,) = json.loads(run.out)["images"]
+    assert found["image"].endswith("image.1003.exr")
+    expected = score(picture(1003), picture(1012), picture(7), with_flip=False).relmse_unbiased
+    assert found["relmse_unbiased"] == pytest.approx(expected)
+    run = in_process(*words, sequences / "none.####.exr")
+    assert run.code == 3
+    assert "none.####.exr have no frame in common" in run.err
+
+
 def test_sequences_write_a_picture_per_frame(sequences: Path) -> None:
     words = ("compare", sequences / "image.####.exr", sequences / "reference.####.exr", "--no-flip", "--heatmap")
     refused = in_process(*words, sequences / "error.png")
@@ -129,6 +174,16 @@ def test_a_reference_without_light_is_refused(lbmc: Runner, pair: tuple[Path, Pa
 
 def test_a_missing_reference_is_named(lbmc: Runner, pair: tuple[Path, Path], tmp_path: Path) -> None:
     assert_one_line(lbmc("compare", pair[0], tmp_path / "none.exr"), "none.exr")
+
+
+def test_one_missing_reference_of_a_sequence_is_named(sequences: Path) -> None:
+    run = in_process("compare", sequences / "image.####.exr", sequences / "none.exr")
+    assert_one_line(run, "none.exr: no such file")
+
+
+def test_a_single_image_has_no_sequence_of_references(sequences: Path) -> None:
+    run = in_process("compare", sequences / "image.1002.exr", sequences / "reference.####.exr")
+    assert_one_line(run, "reference.####.exr: is a sequence", "image.1002.exr is a single file")
 
 
 def test_sequences_without_a_common_frame_are_refused(sequences: Path) -> None:

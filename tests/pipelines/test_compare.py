@@ -58,6 +58,13 @@ def test_a_black_reference_is_refused(tmp_path: Path) -> None:
         compare(image, reference)
 
 
+def test_a_reference_that_is_black_but_for_some_pixels_is_not_called_dark(tmp_path: Path) -> None:
+    stars = np.zeros((16, 20, 3))
+    stars[3, 3] = 5.0
+    with pytest.raises(InputError, match=r"b.exr: 99 % of the reference's values are black"):
+        compare(write_flat(tmp_path / "a.exr", picture(0)), write_flat(tmp_path / "b.exr", stars))
+
+
 def test_pixels_that_are_not_finite_are_counted(tmp_path: Path) -> None:
     broken = picture(0)
     broken[3, 4, 1], broken[5, 5] = np.nan, np.inf

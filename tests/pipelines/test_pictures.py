@@ -9,7 +9,15 @@ import pytest
 from PIL import Image
 
 from model.metrics import score
-from pipelines.pictures import diverging_colors, heat_map, panel, signed_error, worst_regions
+from pipelines.pictures import (
+    HEAT_MAP_CORNER,
+    diverging_colors,
+    heat_map,
+    panel,
+    pooled,
+    signed_error,
+    worst_regions,
+)
 
 
 def pair(shape: tuple[int, int] = (40, 60)) -> tuple[np.ndarray, np.ndarray]:
@@ -74,6 +82,12 @@ def test_worst_regions_are_disjoint_and_start_with_the_worst() -> None:
             assert abs(a[0] - b[0]) >= 8 or abs(a[1] - b[1]) >= 8
 
 
+def test_what_rounding_leaves_is_no_region() -> None:
+    error = np.zeros((200, 300))
+    error[50:60, 50:60] = np.random.default_rng(0).uniform(0.1, 0.9, (10, 10))
+    assert len(worst_regions(error, 40)) == 1
+
+
 def test_no_region_is_worst_where_there_is_no_error() -> None:
     assert worst_regions(np.zeros((20, 20)), 4) == []
     assert worst_regions(np.ones((3, 20)), 4) == []
@@ -84,6 +98,42 @@ def test_the_heat_map_is_a_picture_with_blue_where_the_image_is_too_dark() -> No
     drawn = np.asarray(Image.open(io.BytesIO(heat_map(0.7 * reference, reference))).convert("RGB")).astype(int)
     middle = drawn[drawn.shape[0] // 3 : drawn.shape[0] // 2, drawn.shape[1] // 3 : drawn.shape[1] // 2]
     assert (middle[..., 2] > middle[..., 0] + 20).mean() > 0.9
+
+
+@pytest.mark.parametrize("shape", [(40, 60), (1, 1), (3, 700), (700, 3)])
+def test_every_pixel_is_a_square_of_the_heat_map(shape: tuple[int, int]) -> None:
+    image, reference = pair(shape)
+    drawn = np.asarray(Image.open(io.BytesIO(heat_map(image, reference))).convert("RGB")).astype(float)
+    dots = 600 // shape[1] if shape[1] < 600 and shape[0] < 600 else 1
+    left, top = HEAT_MAP_CORNER
+    squares = drawn[top : top + shape[0] * dots, left : left + shape[1] * dots]
+    steps = (np.clip(signed_error(image, reference), -1.0, 1.0) + 1.0) / 2.0 * 257.0
+    colors = 255.0 * diverging_colors()[np.minimum(steps.astype(int), 256)]
+    np.testing.assert_allclose(squares, colors.repeat(dots, axis=0).repeat(dots, axis=1), atol=1.0)
+
+
+def test_blocks_keep_thin_lines_and_noise_and_the_sign() -> None:
+    error = np.zeros((7, 10))
+    error[:, 3], error[6, 8] = -0.5, 30.0
+    found = pooled(error, 3)
+    assert found.shape == (3, 4)
+    np.testing.assert_allclose(found[:, 1], -0.5 / 3**0.5)
+    assert found[2, 2] == pytest.approx(1.0 / 3**0.5)  # one row of three pixels is left; clamped at 1
+    assert not found[:, 0].any()
+    noise = np.random.default_rng(1).choice([-0.4, 0.4], (30, 30))
+    np.testing.assert_allclose(np.abs(pooled(noise, 5)), 0.4)
+    np.testing.assert_array_equal(pooled(error, 1), np.clip(error, -1.0, 1.0))
+
+
+def test_the_overview_of_a_panel_loses_no_thin_line() -> None:
+    reference = np.full((300, 1500, 3), 0.5)
+    image = reference.copy()
+    image[:, 100:1500:189] *= 3.0  # eight lines of one pixel
+    image[220:280, 600:800] *= 3.0  # draws the marks of the regions away from the rows looked at
+    drawn = np.asarray(Image.open(io.BytesIO(panel({"image": image}, reference))).convert("RGB")).astype(int)
+    top = drawn[40:60, drawn.shape[1] * 63 // 100 : -100]
+    red = (top[..., 0] > top[..., 2] + 30).mean(axis=0) > 0.9
+    assert np.count_nonzero(np.diff(red.astype(int)) == 1) == 8
 
 
 @pytest.mark.parametrize("shape", [(40, 60), (1, 1), (2, 90)])
