@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from model.metrics import geometric_mean
 
-ABLATIONS = Path(__file__).resolve().parent / "results" / "ablations.json"
+HOME = Path(__file__).resolve().parent.parent
+ABLATIONS = HOME / "docs" / "results" / "ablations.json"
 BASE, LAYER_TOPICS = "base", ("", "layers")
 MEANS: Mapping[str, Callable[[list[float]], float]] = {
     "relmse": geometric_mean, "trimmed": geometric_mean, "smape": lambda values: float(np.mean(values))}
@@ -74,18 +77,20 @@ def costs(rows: Mapping[int, Row]) -> list[str]:
             f"{mean_of(rows, 'cpu_seconds_a_megapixel'):.1f}", order]
 
 
-def changes(document: Row) -> str:
-    """Every change of the base, topic by topic."""
+def changes(document: Row, planned: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Every change of the base, topic by topic; of those planned, name -> topic, also the ones without a run."""
     found = runs_of(document)
     base = found.pop(BASE)
     lines = [["", "the base", str(len(base)), *["1"] * len(MEANS), *costs(base)]]
-    topics = list(dict.fromkeys(row["group"] for rows in found.values() for row in rows.values()))
-    for topic in topics:
-        for name, rows in found.items():
-            paired = {seed: row for seed, row in rows.items() if seed in base and row["group"] == topic}
+    topic_of = {**planned, **{name: row["group"] for name, rows in found.items() for row in rows.values()}}
+    for topic in dict.fromkeys(topic_of.values()):
+        for name in (name for name, its in topic_of.items() if its == topic):
+            paired = {seed: row for seed, row in found.get(name, {}).items() if seed in base}
             if paired:
                 cells = [cell(ratios(paired, base, key), spread(base, key)) for key in MEANS]
                 lines.append([topic, name, str(len(paired)), *cells, *costs(paired)])
+            else:
+                lines.append([topic, name, "not run", *["–"] * (len(MEANS) + 4)])
     return markdown(("topic", "change", "seeds", *TITLES.values(), "multiply-adds", "CPU s a step", "CPU s a Mpx",
                      "front is nearer"), lines)
 
@@ -104,7 +109,15 @@ def load() -> Row:
     return document
 
 
+def planned_changes() -> dict[str, str]:
+    """Name and topic of what benchmarks/ablations.py would run."""
+    sys.path.append(str(HOME / "benchmarks"))
+    from ablations import CHANGES
+
+    return {change.name: change.topic for change in CHANGES}
+
+
 ABLATION_TABLES: Mapping[str, Callable[[], str]] = {
-    "ablations": lambda: changes(load()),
+    "ablations": lambda: changes(load(), planned_changes()),
     "ablations-base": lambda: seeds(load()),
 }
