@@ -147,7 +147,9 @@ def _pictures(options: CompareOptions, frames: list[Frame]) -> dict[str, Callabl
     if options.panel is not None and options.panel == options.heat_map:
         raise UsageError(f"{options.panel}: is to be both heat map and panel; give each a name of its own")
     asked = {options.heat_map: Comparison.heat_map, options.panel: Comparison.panel}
-    pictures = {pattern: draw for pattern, draw in asked.items() if pattern is not None}
+    pictures: dict[str, Callable[[Comparison], bytes]] = {
+        pattern: draw for pattern, draw in asked.items() if pattern is not None
+    }
     for pattern in pictures:
         if Path(pattern).suffix.lower() != ".png":
             raise UsageError(f"{pattern}: a PNG is written; give it a name that ends in .png")
