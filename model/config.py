@@ -169,6 +169,7 @@ FAST = Config(
         bottleneck=(160,),
         decoder=((160, 160), (128, 128), (96, 96), (64, 64)),
         scale=2,
+        fine=(32, 32, 32, 32),
     ),
     reducer=(32, 32, 24),
     partitioner=(24, 16),
