@@ -83,14 +83,16 @@ def bench(options: BenchOptions) -> Results:
     and for models that do not.
     """
     scenes = find_scenes(options.folder, options.match)
-    try:
-        options.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{options.out}: cannot be made a folder ({error.strerror})") from error
     targets = [options.out / name for name in (RESULTS, TABLE, REPORT)]
-    for target in targets:
-        output_action(target, [scene.source for scene in scenes], "overwrite" if options.overwrite else "refuse")
+    if options.out.is_dir():
+        for target in targets:
+            output_action(target, [scene.source for scene in scenes], "overwrite" if options.overwrite else "refuse",
+                          can_skip=False)
     with tempfile.TemporaryDirectory(prefix="lbmc-bench-") as folder, Bench(options, scenes, Path(folder)) as run:
+        try:  # only now, when every model was found, but before any work
+            options.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{options.out}: cannot be made a folder ({error.strerror})") from error
         results, gallery = run.measure()
     texts = (json.dumps(_plain(results.to_dict()), indent=1, ensure_ascii=False) + "\n", markdown_report(results),
              html_report(results, gallery))
@@ -150,9 +152,7 @@ class Bench:
         options = self.options
         curves = [(scene, most) for scene in self.scenes for most in scene.thinned_counts()] if options.curves else []
         frames = self._frames()
-        self.untrained = frames[self.example.name]
-        if options.frame > UNTRAINED_FRAME and options.paper:
-            self.untrained = self._enlarged(self.example, UNTRAINED_FRAME)
+        self.untrained = self._untrained(frames[self.example.name])
         steps = len(self.scenes) + len(frames) * (1 + options.repeats) + len(curves) + len(options.growth)
         with_memory = options.memory and measurable()
         steps += len(self.specs) if with_memory else 0
@@ -198,6 +198,14 @@ class Bench:
             scene = next(scene for scene in self.scenes if scene.samples == samples)
             frames[scene.name] = self._enlarged(scene, self.options.frame)
         return frames
+
+    def _untrained(self, timed: TimedFrame) -> TimedFrame:
+        """What untrained networks are timed on: the frame that the others have, or a smaller one."""
+        side: int = self.results.protocol["untrained_frame"]
+        if not side or not self.options.paper or timed.megapixels <= side * side / 1e6:
+            return timed
+        source = self.folder / f"{self.example.name}.untrained.exr"
+        return TimedFrame(self.example.name, source, write_enlarged(self.example, side, source, exact=True))
 
     def _enlarged(self, scene: Scene, side: int) -> TimedFrame:
         source = self.folder / f"{scene.name}.{side}.exr"

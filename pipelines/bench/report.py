@@ -20,7 +20,7 @@ from model.metrics import common_scale, geometric_mean, tone_mapped
 from pipelines.bench.charts import Line, Mark, Style, bars, lines, number, scatter
 from pipelines.bench.methods import STAGES, MethodSpec
 from pipelines.bench.results import Results, pareto
-from pipelines.bench.tables import FULL_HD, Table, all_tables, front_points, protocol_lines
+from pipelines.bench.tables import FULL_HD, Table, all_tables, front_points, memory_frames, protocol_lines
 
 Image = NDArray[np.floating[Any]]
 
@@ -116,7 +116,7 @@ def _charts(results: Results) -> list[str]:
     charts += _stages(results)
     memory = [(name, {"filter": peak / 2**20}) for name, peak in results.memory.items()]
     if memory:
-        charts.append(_figure(f"Peak memory on {results.protocol['example']}",
+        charts.append(_figure(f"Peak memory on {memory_frames(results)}",
                               bars(memory, {"filter": "#7a8aa8"}, {"filter": "beyond the libraries"}, "MiB")))
     return charts
 

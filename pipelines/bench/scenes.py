@@ -109,10 +109,13 @@ def thin(samples: DeepSamples, most: int, seed: int = SEED) -> DeepSamples:
     return DeepSamples(np.minimum(samples.counts, most).astype(np.int32), channels, samples.window)
 
 
-def enlarge(samples: DeepSamples, side: int) -> DeepSamples:
-    """The frame repeated in mirror image, to `side` pixels along each side that has fewer, at the origin."""
+def enlarge(samples: DeepSamples, side: int, *, exact: bool = False) -> DeepSamples:
+    """The frame repeated in mirror image, to `side` pixels along each side that has fewer, at the origin.
+
+    With `exact`, of a side that has more only the middle is left.
+    """
     height, width = samples.counts.shape
-    rows, columns = (_mirrored(size, max(size, side)) for size in (height, width))
+    rows, columns = (_mirrored(size, side if exact else max(size, side)) for size in (height, width))
     pixels = (rows[:, None] * width + columns).ravel()
     counts = samples.counts.ravel()[pixels]
     ends = np.cumsum(counts, dtype=np.int64)
@@ -124,15 +127,15 @@ def enlarge(samples: DeepSamples, side: int) -> DeepSamples:
 
 
 def _mirrored(size: int, length: int) -> NDArray[np.int64]:
-    """0 .. size-1, back to 0, and so on: (length,)."""
-    place = np.arange(length) % (2 * size)
+    """0 .. size-1, back to 0, and so on: (length,); the middle of it where `length` is less."""
+    place = (np.arange(length) + max(size - length, 0) // 2) % (2 * size)
     return np.minimum(place, 2 * size - 1 - place)
 
 
-def write_enlarged(scene: Scene, side: int, target: Path) -> float:
-    """Writes the scene enlarged to `side` x `side` pixels or more; returns its megapixels."""
+def write_enlarged(scene: Scene, side: int, target: Path, *, exact: bool = False) -> float:
+    """Writes the scene enlarged to `side` x `side` pixels or more, or exactly that; returns its megapixels."""
     samples, header = read_deep(scene.source)
-    large = enlarge(samples, side)
+    large = enlarge(samples, side, exact=exact)
     write_deep(target, large, replace(header, data_window=large.window, display_window=large.window))
     return large.counts.size / 1e6
 

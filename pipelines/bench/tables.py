@@ -70,6 +70,8 @@ def methods_table(results: Results, samples: int) -> Table:
     note += (f"Times are of the method's own work (all but {', '.join(OUTSIDE)}), scaled by pixels to 1920 x 1080. "
              "★ is on the Pareto front of CPU time and relMSE. Untrained networks have random weights, so they have a "
              "time but no error.")
+    if results.memory:
+        note += f" MiB is peak memory on {memory_frames(results)}."
     errors = ("relMSE", "interval", "trimmed", "SMAPE", "PSNR", "SSIM", "FLIP", "energy")
     head = ("method", *errors, "CPU s", "wall s", "MiB")
     return Table(f"{count} scene{'s' if count != 1 else ''} with {samples} samples per pixel", head, rows, note)
@@ -179,11 +181,20 @@ def markdown_report(results: Results) -> str:
         table.markdown() for table in all_tables(results))
 
 
+def memory_frames(results: Results) -> str:
+    """What memory was measured on: not the same for all, and memory grows with the frame."""
+    example, frame, small = (results.protocol[key] for key in ("example", "frame", "untrained_frame"))
+    scene = next(scene for scene in results.scenes if scene.name == example)
+    width, height = max(scene.width, frame), max(scene.height, frame)
+    unlike = 0 < small * small < width * height and any(spec.family == "paper" for spec in results.methods)
+    return f"{example}, {width} x {height}" + (f", of untrained networks on {small} x {small}" if unlike else "")
+
+
 def _timed(frame: int) -> str:
     if not frame:
         return "Times are of every scene as it is"
     return ("Times are of the first scene of each number of samples, repeated in mirror image to "
-            f"{frame} x {frame} pixels")
+            f"{frame} x {frame} pixels unless larger")
 
 
 def _errors(row: Summary) -> list[str]:

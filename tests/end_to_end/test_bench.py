@@ -127,11 +127,13 @@ def test_growth_counts_the_papers_networks_and_ours(results: dict[str, Any]) -> 
     assert {p["network"] for p in results["growth"] if p["cpu"] is not None} == {"lbmc tiny"}
 
 
-def test_memory_is_measured(results: dict[str, Any]) -> None:
+def test_memory_is_measured(results: dict[str, Any], report: Path) -> None:
     if Path("/proc/self/status").is_file():
         assert set(results["memory"]) == {method["name"] for method in results["methods"]}
         assert all(0 < peak < 4 << 30 for peak in results["memory"].values())
         assert results["memory"]["noisy"] < results["memory"]["lbmc tiny"]
+        for name in ("results.md", "report.html"):
+            assert "eak memory on first, 32 x 24" in (report / name).read_text("utf-8")
 
 
 def test_the_page_asks_for_nothing_from_outside(report: Path) -> None:
@@ -153,8 +155,8 @@ def test_results_survive_json(results: dict[str, Any]) -> None:
 def test_an_unscored_network_has_a_time_and_no_error(
     folder: Path, tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The paper's networks, on a frame of their own, which is smaller."""
-    monkeypatch.setattr("pipelines.bench.job.UNTRAINED_FRAME", 36)
+    """The paper's networks, on a frame of their own, which is smaller even than the scene."""
+    monkeypatch.setattr("pipelines.bench.job.UNTRAINED_FRAME", 16)
     words = [40 if word == 0 else word for word in QUICK if word != "--no-paper"]
     run = in_process("bench", folder, "--match", "first", "--out", tmp_path, "--model", weights, *words)
     assert run.code == 0, run.err
@@ -163,9 +165,9 @@ def test_an_unscored_network_has_a_time_and_no_error(
     for name in ("PIXELGATHER", "SAMPLESPLAT", "LAYER", "LAYER_w", "OPTIMIZED"):
         assert rows[f"{name} (untrained)"]["scores"] is None
         assert rows[f"{name} (untrained)"]["cpu"]["unet"] > 0.0
-        assert rows[f"{name} (untrained)"]["megapixels"] == 36 * 36 / 1e6
+        assert rows[f"{name} (untrained)"]["megapixels"] == 16 * 16 / 1e6
     assert rows["lbmc tiny"]["megapixels"] == 40 * 40 / 1e6
-    assert "on 36 x 36 pixels of it" in run.out
+    assert "on 16 x 16 pixels of it" in run.out
     assert {p["network"] for p in found["growth"] if p["cpu"]} == {"LAYER", "SAMPLESPLAT", "lbmc tiny"}
     assert re.search(r"\| LAYER \(untrained\) \| – \|", run.out)
 
@@ -175,6 +177,7 @@ def test_results_that_exist_are_kept(report: Path, folder: Path) -> None:
     run = in_process("bench", folder, "--out", report, *QUICK)
     assert run.code == 2
     assert "--overwrite" in run.err
+    assert "--skip-existing" not in run.err  # bench has no such option
     assert (report / "results.json").read_bytes() == before
 
 
@@ -221,6 +224,13 @@ def test_references_that_nothing_can_be_measured_on_are_refused(tmp_path: Path, 
     write_pair(tmp_path, "scene", 1)
     write_reference(tmp_path / "scene.ref.exr", np.full((24, 32, 3), value))
     assert_one_line(in_process("bench", tmp_path), "scene.ref.exr", words)
+
+
+def test_a_model_that_is_not_there_leaves_no_folder_behind(folder: Path, tmp_path: Path) -> None:
+    run = in_process("bench", folder, "--out", tmp_path / "out", "--model", "none", *QUICK)
+    assert run.code == 2
+    assert "none" in run.err
+    assert not (tmp_path / "out").exists()
 
 
 def test_two_models_of_one_name_are_refused(folder: Path, weights: Path, tmp_path: Path) -> None:

@@ -125,6 +125,14 @@ def test_zoom_is_kept_between_methods_and_shared_side_by_side(browser: Any) -> N
     assert browser.find_element("id", "zoom").text == "100 %"
 
 
+def test_pixels_are_squares_unless_the_image_is_made_smaller(browser: Any) -> None:
+    rendering = "return getComputedStyle(document.querySelector('.pane img')).imageRendering"
+    assert browser.execute_script(rendering) == "pixelated"
+    resize = ("document.querySelector('.pane').style.height = '{}'; window.dispatchEvent(new Event('resize'));")
+    assert browser.execute_script(resize.format("10px") + rendering) == "auto"  # the image is 24 pixels high
+    assert browser.execute_script(resize.format("") + rendering) == "pixelated"
+
+
 def test_dragging_moves_the_image(browser: Any) -> None:
     from selenium.webdriver import ActionChains
 

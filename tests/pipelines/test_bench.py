@@ -25,6 +25,7 @@ from pipelines.bench.methods import MethodSpec, make, method_specs
 from pipelines.bench.report import Gallery
 from pipelines.bench.results import Measurement, Results, SceneInfo, pareto
 from pipelines.bench.scenes import enlarge, find_scenes, thin, write_thinned
+from pipelines.bench.tables import memory_frames
 from tests.end_to_end.bench_scenes import WINDOW, write_pair
 from tests.end_to_end.scenes import noisy_scene
 from tests.model.random_models import SMALL
@@ -131,6 +132,11 @@ def test_an_enlarged_scene_is_its_mirror_images() -> None:
             large.channels["number"][large.offsets[new] : large.offsets[new + 1]],
             np.arange(scene.offsets[old], scene.offsets[old + 1]))
     assert enlarge(scene, 8).counts.shape == (height, width)
+    middle = enlarge(scene, 8, exact=True)
+    assert middle.counts.shape == (8, 8)
+    old = (height - 8) // 2 * width + (width - 8) // 2
+    np.testing.assert_array_equal(
+        middle.channels["number"][: middle.counts[0, 0]], np.arange(scene.offsets[old], scene.offsets[old + 1]))
 
 
 def test_scenes_are_chosen_by_name(tmp_path: Path) -> None:
@@ -160,6 +166,14 @@ def test_means_are_per_megapixel_and_geometric_for_relmse() -> None:
     assert found.cpu == {"read": pytest.approx(0.5), "filter": pytest.approx(1.0)}
     assert found.own_cpu == pytest.approx(1.0)
     assert found.own_wall == pytest.approx(2.0)
+
+
+def test_memory_says_on_which_frames_it_was_measured() -> None:
+    protocol = {"example": "a", "frame": 512, "untrained_frame": 256}
+    results = Results({}, protocol, [MethodSpec("m", "classical", "blur")], [SceneInfo("a", 1000, 100, 8)])
+    assert memory_frames(results) == "a, 1000 x 512"
+    results.methods.append(MethodSpec("LAYER", "paper", "untrained", "LAYER"))
+    assert memory_frames(results) == "a, 1000 x 512, of untrained networks on 256 x 256"
 
 
 @pytest.mark.parametrize(("value", "text"), [(0.0, "0"), (0.01234, "0.0123"), (12.0, "12"), (19612.3, "19,612"),

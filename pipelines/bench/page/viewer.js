@@ -21,6 +21,8 @@
       const left = pane.clientWidth / 2 - state.x * width * scale;
       const top = pane.clientHeight / 2 - state.y * height * scale;
       pane.firstChild.style.transform = `translate(${left}px, ${top}px) scale(${scale})`;
+      // Pixels as squares when enlarged; made smaller, a choice of pixels would show noise that is not there.
+      pane.firstChild.style.imageRendering = scale * window.devicePixelRatio < 1 ? "auto" : "pixelated";
     }
     byId("zoom").textContent = `${Math.round(100 * state.zoom)} %`;
   }
