@@ -217,7 +217,7 @@ def decision_lines(seen: Survey) -> list[str]:
     mixed = "" if seen.mixed is None else f": depth mixes in {seen.mixed:.1%} of the pixels"
     return [
         f"exposure {seen.exposure:.6g}, depth scale {seen.depth:.6g}",
-        f"layers {'1' if decided.one_layer else 'as many as the network has'}{mixed}",
+        f"layers {'1, nothing is hit' if decided.one_layer else f'as many as the network has{mixed}'}",
         *decided.lines(),
         *([f"held, 0 in every sample: {' '.join(zeros)}"] if zeros else []),
         *seen.cells.lines(),

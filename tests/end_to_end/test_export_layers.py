@@ -306,7 +306,7 @@ def test_a_dry_run_writes_nothing(weights: Weights, source: Path, tmp_path: Path
 
 def test_a_frame_that_needs_one_layer_still_gives_the_files_that_a_comp_counts_on(tmp_path: Path) -> None:
     samples = noisy_scene()
-    flat = changed(samples, Z=np.full(samples.total, 3, np.float32), A=np.ones(samples.total, np.float16))
+    flat = changed(samples, A=np.zeros(samples.total, np.float16))
     source = write_scene(tmp_path / "in.deep.exr", flat)
     weights = random_weights(tmp_path / "w.safetensors")
     common = ["--model", str(weights), "--pixel-type", "float", "--progress", "none"]
