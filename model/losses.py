@@ -39,7 +39,8 @@ class LossWeights:
     tone_mapped: Annotated[float, "squared error of the pictures as sRGB of log(1 + x)"] = 0.0
     pooled: Annotated[
         tuple[tuple[int, float], ...],
-        "pairs of a cell size in pixels and the weight of the SMAPE of pictures averaged over such cells"
+        "pairs of a cell size in pixels, up to that of a crop, and the weight of the SMAPE of pictures averaged over such "
+        "cells"
     ] = ((8, 0.5), (32, 0.5))
 
 
@@ -92,5 +93,6 @@ def total_loss(prediction: Tensor, target: Tensor, weights: LossWeights) -> Tens
     if weights.relative:
         loss = loss + weights.relative * log_relative(prediction, target)
     for size, weight in weights.pooled:
+        size = min(size, *prediction.shape[-2:])
         loss = loss + weight * smape(F.avg_pool2d(prediction, size), F.avg_pool2d(target, size))
     return loss

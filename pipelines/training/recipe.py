@@ -102,8 +102,8 @@ class Recipe:
         if self.finish > 0 and self.finish_loss is None:
             raise ValueError("finish is above 0, but there is no finish_loss")
         for size, _ in (*self.loss.pooled, *(self.finish_loss.pooled if self.finish_loss else ())):
-            if not 1 <= size <= SMALLEST_CROP:
-                raise ValueError(f"pooled cells must be 1 to {SMALLEST_CROP} pixels, not {size}")
+            if not 1 <= size <= self.crop:
+                raise ValueError(f"pooled cells must be 1 to {self.crop} pixels, as large as a crop, not {size}")
 
     def loss_at(self, step: int) -> LossWeights:
         """What step `step`, from 0, minimises."""

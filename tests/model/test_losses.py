@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from model.losses import LossWeights, tone_mapped, total_loss
+from model.losses import LossWeights, smape, tone_mapped, total_loss
 
 
 def picture(value: float) -> torch.Tensor:
@@ -87,3 +87,11 @@ def test_a_lamp_that_leaks_into_the_dark_is_measured_by_the_dark() -> None:
     expected = 19.5**2 / (2.1**2 + 0.01)  # 4 * 0.5 + 0.1 rather than 20
     saturated = math.log(expected / (1 + expected / 100) + 1e-3)
     assert float(total_loss(picture(20.0), picture(0.5), relative)) == pytest.approx(saturated, rel=1e-5)
+
+
+def test_a_pooled_cell_larger_than_the_picture_is_the_picture() -> None:
+    draw = torch.Generator().manual_seed(4)
+    prediction, target = (torch.rand(2, 3, 12, 16, generator=draw) for _ in range(2))
+    weights = LossWeights(smape=0.0, relative=0.0, pooled=((64, 1.0),))
+    blocks = [picture[..., :12, :12].mean((2, 3)) for picture in (prediction, target)]  # square cells, the rest is cut
+    assert float(total_loss(prediction, target, weights)) == pytest.approx(float(smape(*blocks)))

@@ -53,7 +53,7 @@ def test_words_set_fields_at_any_depth() -> None:
         ("average=1.5", "average is 1.5; it must be between 0 and 1"),
         ("learning_rate=0", "learning_rate is 0.0; it must be above 0"),
         ("finish=0.5", "no finish_loss"),
-        ("loss.pooled=[[64,1]]", "pooled cells must be 1 to 32 pixels"),
+        ("loss.pooled=[[256,1]]", "pooled cells must be 1 to 128 pixels"),
         ("augmentation.firefly_gain=[2,1]", "firefly_gain must rise"),
         ("loss=3", "loss must be an object of smape"),
     ],
