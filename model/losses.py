@@ -39,8 +39,8 @@ class LossWeights:
     tone_mapped: Annotated[float, "squared error of the pictures as sRGB of log(1 + x)"] = 0.0
     pooled: Annotated[
         tuple[tuple[int, float], ...],
-        "pairs of a cell size in pixels, up to that of a crop, and the weight of the SMAPE of pictures averaged over such "
-        "cells"
+        "pairs of a cell size in pixels, up to that of a crop, and the weight of the SMAPE of pictures averaged over "
+        "such cells"
     ] = ((8, 0.5), (32, 0.5))
 
 
