@@ -19,6 +19,8 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from ablation_tables import ABLATION_TABLES
+from adapting_tables import ADAPTING_TABLES
+from quality_tables import QUALITY_TABLES
 from result_tables import RESULT_TABLES
 
 from deep_io.aliases import ALIASES, CAMERA_Z_FORWARD, DISTANCE, NOT_A_ROLE, RENDERER_MARKS, VIEW, WORLD, Alias
@@ -121,6 +123,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "recipe": recipe,
     **RESULT_TABLES,
     **ABLATION_TABLES,
+    **ADAPTING_TABLES,
+    **QUALITY_TABLES,
 }
 
 
