@@ -134,17 +134,18 @@ class Denoiser(nn.Module):
         keep = kept_logits(layers or config.layers, config.partition_logits)
         if in_one_chunk(samples) and config.variant != "sample_splat":
             samples = samples.by_turns()
+        if torch.is_grad_enabled() or config.kernel != "affinity" or (wanted is not None and bool(wanted.all())):
+            wanted = None
+        seen = None if wanted is None else sources_of(wanted, config.kernel_sizes)
         relative = self._surroundings(samples, scale)
-        contexts, embedding = self._context(samples, relative, scale)
+        contexts, embedding = self._context(samples, relative, scale, seen)
         context = _rows(contexts[0], samples.shape)  # (P, C)
         if config.variant == "sample_splat":
             visible = self._splat_samples(samples, embedding, context, scale)
         elif config.kernel == "direct":
             visible = self._filter_direct(samples, embedding, relative, contexts, context, scale, keep)
         else:
-            if torch.is_grad_enabled() or (wanted is not None and bool(wanted.all())):
-                wanted = None
-            visible = self._filter_affinity(samples, embedding, relative, context, scale, keep, wanted)
+            visible = self._filter_affinity(samples, embedding, relative, context, scale, keep, wanted, seen)
         result = to_layers(visible)
         return fill_holes(result) if fill else result
 
@@ -176,8 +177,12 @@ class Denoiser(nn.Module):
 
     # --- context ---------------------------------------------------------------------------------------------------
 
-    def _context(self, samples: Samples, relative: Tensor | None, scale: FrameScale) -> tuple[list[Tensor], Tensor]:
-        """Context pictures, finest first, of the size padded to the stride; the embeddings (n, E) of the last chunk."""
+    def _context(self, samples: Samples, relative: Tensor | None, scale: FrameScale, seen: Tensor | None = None
+                 ) -> tuple[list[Tensor], Tensor]:
+        """Context pictures, finest first, of the size padded to the stride; the embeddings (n, E) of the last chunk.
+
+        `seen` : (B, H, W) bool, pixels whose context will be used; None: all
+        """
         rows = []
         for part in chunks(samples, relative):
             embedding = self.reducer(part.samples, scale)
@@ -187,7 +192,8 @@ class Denoiser(nn.Module):
         picture = picture.permute(0, 3, 1, 2)  # channels last in memory
         stride = self.config.unet.stride
         padded = F.pad(picture, (0, -width % stride, 0, -height % stride))
-        return [level.to(picture.dtype) for level in reversed(self.unet.levels(padded))], embedding
+        box = None if seen is None else box_of(seen)
+        return [level.to(picture.dtype) for level in reversed(self.unet.levels(padded, box))], embedding
 
     # --- samples to layers -----------------------------------------------------------------------------------------
 
@@ -241,12 +247,11 @@ class Denoiser(nn.Module):
     # --- kernels, filter, compositing ------------------------------------------------------------------------------
 
     def _filter_affinity(self, samples: Samples, embedding: Tensor, relative: Tensor | None, context: Tensor,
-                         scale: FrameScale, keep: list[int], wanted: Tensor | None) -> Tensor:
+                         scale: FrameScale, keep: list[int], wanted: Tensor | None, seen: Tensor | None) -> Tensor:
         """(B, L, 6 + E, H, W) visible planes."""
         planes, predictions = [], []
         sources, active, box = None, None, (slice(None), slice(None))
-        if wanted is not None:
-            seen = sources_of(wanted, self.config.kernel_sizes)
+        if wanted is not None and seen is not None:
             sources, box = seen.flatten(), box_of(seen)
             active = cells_with(wanted[:, *box], TARGET_CELL).repeat_interleave(len(keep), 0)
         for rows, part in self._splat_chunks(samples, embedding, relative, context, scale, keep, sources):

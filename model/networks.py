@@ -16,6 +16,9 @@ from model.config import UNetConfig
 
 LEAK = 0.01
 
+Box = tuple[slice, slice]
+"""Rows and columns of a picture, with starts and stops."""
+
 
 class Products(nn.Module):
     """A module whose matrix products may run in a lower precision than float32; its outputs keep that type."""
@@ -123,12 +126,26 @@ class _Fine(nn.Module):
         assert self.last.bias is not None
         nn.init.zeros_(self.last.bias)
 
-    def forward(self, picture: Tensor, context: Tensor) -> Tensor:
-        """picture (B, inputs, H, W), context (B, C, H / scale, W / scale) -> (B, C, H, W)."""
+    def forward(self, picture: Tensor, context: Tensor, box: Box | None = None) -> Tensor:
+        """picture (B, inputs, H, W), context (B, C, H / scale, W / scale) -> (B, C, H, W).
+
+        `box` : nothing is added elsewhere; not with a gradient
+        """
         size = picture.shape[-2:]
-        x = self.from_picture(picture) + _enlarged(self.from_context(context), size)
-        added: Tensor = self.last(self.block(F.leaky_relu_(x, LEAK)))
-        return _enlarged(context, size) + added
+        enlarged, hidden = _enlarged(context, size), _enlarged(self.from_context(context), size)
+        if box is None:
+            return enlarged + self._added(picture, hidden)
+        halo = len(self.block.convolutions)
+        top, left = (max(side.start - halo, 0) for side in box)
+        wide = (..., slice(top, box[0].stop + halo), slice(left, box[1].stop + halo))
+        inside = (..., slice(box[0].start - top, box[0].stop - top), slice(box[1].start - left, box[1].stop - left))
+        enlarged[..., box[0], box[1]] += self._added(picture[wide], hidden[wide])[inside]
+        return enlarged
+
+    def _added(self, picture: Tensor, hidden: Tensor) -> Tensor:
+        x = self.block(F.leaky_relu_(self.from_picture(picture) + hidden, LEAK))
+        added: Tensor = self.last(x)
+        return added
 
 
 def _enlarged(x: Tensor, size: Sequence[int]) -> Tensor:
@@ -159,12 +176,15 @@ class UNet(Products):
     def forward(self, x: Tensor) -> Tensor:
         return self.levels(x)[-1]
 
-    def levels(self, x: Tensor) -> list[Tensor]:
-        """The decoder's outputs, coarsest first; the last one has been through the head and has the input's size."""
-        with self.products(x):
-            return self._levels(x)
+    def levels(self, x: Tensor, box: Box | None = None) -> list[Tensor]:
+        """The decoder's outputs, coarsest first; the last one has been through the head and has the input's size.
 
-    def _levels(self, x: Tensor) -> list[Tensor]:
+        `box` : where the last one is wanted; what is cheap to leave out elsewhere is. Not with a gradient.
+        """
+        with self.products(x):
+            return self._levels(x, box)
+
+    def _levels(self, x: Tensor, box: Box | None) -> list[Tensor]:
         picture = x
         if self.config.scale > 1:
             x = F.avg_pool2d(x, self.config.scale)
@@ -180,7 +200,7 @@ class UNet(Products):
             outputs.append(x)
         x = self.head(x)
         if self.fine is not None:
-            x = self.fine(picture, x)
+            x = self.fine(picture, x, box)
         elif self.config.scale > 1:
             x = _enlarged(x, picture.shape[-2:])
         outputs[-1] = x
