@@ -93,7 +93,8 @@ def test_workers_end_when_the_command_is_killed(at_work: bool, tmp_path: Path) -
 
 
 def test_a_killed_worker_is_told_with_the_cure(tmp_path: Path) -> None:
-    process, workers = started(tmp_path, *ENDLESS, "--count", 2)
+    process, workers = started(tmp_path, *QUICK)
+    wait_until(lambda: any(tmp_path.glob("*.json")), "a scene was there")
     os.kill(workers.pop(), signal.SIGKILL)
     _, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1
