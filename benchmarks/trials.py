@@ -18,6 +18,7 @@ from typing import Any
 
 import torch
 
+from deep_io.atomic import atomic_output
 from deep_io.errors import InputError
 from model import zoo
 from model.config import Config
@@ -150,9 +151,8 @@ def row_of(run: Run, seconds: float, found: Row, seconds_a_megapixel: float) -> 
 def write(path: Path, document: Row) -> None:
     """Whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
-    part.replace(path)
+    with atomic_output(path) as part:
+        part.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
 
 
 def nothing_more(weights: Path, run: Run, sets: dict[str, Scenes]) -> Row:
