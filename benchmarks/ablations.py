@@ -96,6 +96,8 @@ CHANGES = (
            recipe=replace(RECIPE, loss=NOISE2NOISE, finish=0.25, finish_loss=CLEAN_FINISH)),
     Change(LAYERS, "3 layers", layers_of(SMALL_FAST, 3)),
     Change(DATA, "a sixteenth of the scenes", one_of=16),
+    Change(KERNELS, "a gate for each guide", replace(SMALL_FAST, guide_gates=3)),
+    Change(KERNELS, "learned features of the divisor", replace(SMALL_FAST, divisor_features=4)),
     Change(LAYERS, "no guard of the entropy", recipe=replace(RECIPE, partition_entropy=0.0)),
 )
 """In order of importance: what a short evening gets done."""

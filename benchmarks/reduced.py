@@ -59,6 +59,8 @@ SMALL_FAST = replace(
     reducer=(16, 16, 16),
     partitioner=(16, 8),
     generator=(24, 24),
+    guide_gates=1,
+    divisor_features=0,
 )
 PIXEL_FAST = replace(SMALL_FAST, variant="pixel_gather", reducer=(), partition_logits=1, layers=1, confidence=False,
                      depth_prior=False)

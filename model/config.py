@@ -76,7 +76,9 @@ class Config:
     kernel_sizes: tuple[int, ...] = (3, 3, 3, 3, 3, 3)
     generator: tuple[int, ...] = (48, 48)  # hidden widths of the kernel generator
     affinity_features: int = 8
+    guide_gates: Literal[1, 3] = 1  # one for all guides of a pixel, or one each for normal, depth and divisor
     demodulation: bool = True  # mix in a path whose kernels average radiance divided by albedo + specular
+    divisor_features: int = 0  # learned features of the kernel that filters the divisor, beside the divisor itself
 
     def __post_init__(self) -> None:
         if len(self.unet.encoder) != len(self.unet.decoder):
@@ -91,6 +93,8 @@ class Config:
             raise ValueError(f"{self.variant} needs direct kernels")
         if self.kernel == "direct" and self.demodulation:
             raise ValueError("demodulation needs affinity kernels")
+        if self.divisor_features and not self.demodulation:
+            raise ValueError("without demodulation no divisor is filtered")
         if self.kernel == "direct" and len(self.kernel_sizes) > 1:
             if self.variant == "sample_splat":
                 raise ValueError("kernels per sample work at the full resolution only")

@@ -18,6 +18,7 @@ from model.partition import BASIC_COLUMNS, FILTERED, hit_depth, share_of
 from model.samples import Samples, columns
 
 GUIDE_SCALES = (2.0, 2.0, 2.0, 3.0, 1.5, 1.5, 1.5)  # normal, log depth, divisor: the joint bilateral filter at step 0
+GUIDE_WIDTHS = (3, 1, 3)
 # What a log unit of glare takes from a source's logit at each coarser level: a cell that holds a corner of a lamp is
 # hardly farther from its dark pixels than one without, and a thousand times brighter.
 GLARE_PER_LEVEL = 0.5
@@ -62,10 +63,10 @@ def demodulated_lights(samples: Samples) -> list[Tensor]:
 
 def generator_sizes(config: Config) -> tuple[int, ...]:
     """What the generator predicts per layer: features, bias and preference per level, gates of guides and glare;
-    with demodulation also the mix, the divisor's gate and the divisor's bias."""
+    with demodulation also the mix, and gate, bias and features of the divisor's kernel."""
     levels = len(config.kernel_sizes)
-    sizes = (config.affinity_features, levels, levels, 1, 1)
-    return (*sizes, 1, 1, 1) if config.demodulation else sizes
+    sizes = (config.affinity_features, levels, levels, config.guide_gates, 1)
+    return (*sizes, 1, 1, 1, config.divisor_features) if config.demodulation else sizes
 
 
 def initial_guides(config: Config) -> Tensor:
@@ -107,7 +108,10 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
     beyond = glare(planes[:, RADIANCE] / own, scale.exposure) * (0.5 + torch.sigmoid(glare_gate))
     guides = planes[:, GUIDES] / own
     bias = bias - beyond * GLARE_PER_LEVEL * torch.arange(bias.shape[1], device=bias.device)[:, None, None]
-    features = features + torch.einsum("bghw,fg->bfhw", guides, guide_matrix) * (2 * torch.sigmoid(gate))
+    gates = 2 * torch.sigmoid(gate)
+    if config.guide_gates > 1:
+        gates = gates.repeat_interleave(torch.tensor(GUIDE_WIDTHS, device=gates.device), 1)
+    features = features + torch.einsum("bghw,fg->bfhw", guides * gates, guide_matrix)
     features = torch.cat([features, GLARE_SCALE * beyond], 1)
     reduced_too = [planes[:, REDUCED]] if config.demodulation else []
     values = torch.cat([planes[:, FILTERED], share, *reduced_too, planes[:, GUIDED_COLUMNS:]], 1)
@@ -115,9 +119,9 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
     if not config.demodulation:
         return out
     plain, others, reduced, extra = torch.split(out, [3, 3, 3, out.shape[1] - 9], 1)
-    mix, divisor_gate, divisor_bias = divided
+    mix, divisor_gate, divisor_bias, learned = divided
     by = guides[:, 4:7]
-    sharp = by * (DIVISOR_GUIDE_SCALE * torch.sigmoid(divisor_gate))
+    sharp = torch.cat([by * (DIVISOR_GUIDE_SCALE * torch.sigmoid(divisor_gate)), learned], 1)
     no_preference = torch.zeros_like(divisor_bias)
     factor = affinity_filter(sharp, divisor_bias, no_preference, log_w, by, (DIVISOR_WINDOW,), active)
     # no own weight near the target: nothing to multiply by, the plain path stands

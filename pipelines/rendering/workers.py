@@ -26,7 +26,7 @@ Work = Callable[[int], str]
 
 @contextmanager
 def worker_pool(workers: int, work: Work, seeds: Iterable[int]) -> Iterator[Work]:
-    """`work` as a function whose results for `seeds` are already being made by `workers` processes.
+    """`work` as a function whose results for `seeds` are already being made by `workers` processes, at most one a seed.
 
     `work` and its results must be picklable. It raises what `work` raised, and LbmcError when a worker was killed.
     When the block is left by an exception, StoppedError included, the workers stop at once and leave no part of a file.
@@ -36,15 +36,15 @@ def worker_pool(workers: int, work: Work, seeds: Iterable[int]) -> Iterator[Work
     listening, alive = context.Pipe(duplex=False)
     pool = ProcessPoolExecutor(workers, context, _end_with_parent, (listening,))
     try:
-        with _ctrl_c_blocked():
+        with _ctrl_c_blocked(), _killed_workers_told():
             futures: dict[int, Future[str]] = {seed: pool.submit(_work_until_stopped, work, seed) for seed in seeds}
+            # The pool learns which workers to watch when something is submitted or done. The last submission may have
+            # started a worker, whose death would go unnoticed until another one's work is done.
+            pool.submit(_nothing)
 
         def result(seed: int) -> str:
-            try:
+            with _killed_workers_told():
                 return futures[seed].result()
-            except BrokenProcessPool as broken:
-                raise LbmcError("a worker process was killed, perhaps for want of memory; run the same command again "
-                                "to go on, with fewer --workers") from broken
 
         yield result
     except BaseException:
@@ -54,6 +54,15 @@ def worker_pool(workers: int, work: Work, seeds: Iterable[int]) -> Iterator[Work
         pool.shutdown(wait=True, cancel_futures=True)
         alive.close()
         listening.close()
+
+
+@contextmanager
+def _killed_workers_told() -> Iterator[None]:
+    try:
+        yield
+    except BrokenProcessPool as broken:
+        raise LbmcError("a worker process was killed, perhaps for want of memory; run the same command again to go on, "
+                        "with fewer --workers") from broken
 
 
 @contextmanager
@@ -77,6 +86,10 @@ def _wait_for_the_end(listening: Connection) -> None:
     os.kill(os.getpid(), signal.SIGTERM)
     threading.Event().wait(GRACE)
     os._exit(SIGNAL_CODE + signal.SIGTERM)
+
+
+def _nothing() -> None:
+    pass
 
 
 def _work_until_stopped(work: Work, seed: int) -> str:

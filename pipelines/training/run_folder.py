@@ -68,14 +68,14 @@ class RunFolder:
             return None
         try:
             data = torch.load(path, map_location=device, weights_only=True)
-            config, recipe = json.loads(data["config"]), json.loads(data["recipe"])
+            config, recipe = Config.from_dict(json.loads(data["config"])), json.loads(data["recipe"])
             found = Checkpoint(State(data["step"], data["rows"], data["losses"]), data["net"], data["averaged"],
                                data["optimizer"])
         except (OSError, RuntimeError, EOFError, KeyError, ValueError, TypeError, pickle.UnpicklingError) as error:
             raise InputError(f"{path}: not a checkpoint of this lbmc ({type(error).__name__}); train into another "
                              f"folder") from None
-        if config != json.loads(json.dumps(self.config.to_dict())):
-            raise UsageError(f"{path}: its network, {config.get('name')!r}, is not the {self.config.name!r} of "
+        if config != self.config:
+            raise UsageError(f"{path}: its network, {config.name!r}, is not the {self.config.name!r} of "
                              f"--network; train into another folder")
         changed = list(differences(self.recipe.to_dict(), recipe))
         if changed:

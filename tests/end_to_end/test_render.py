@@ -92,9 +92,11 @@ def test_workers_end_when_the_command_is_killed(at_work: bool, tmp_path: Path) -
     assert not list(tmp_path.glob(".*")), "no half-written file"
 
 
-def test_a_killed_worker_is_told_with_the_cure(tmp_path: Path) -> None:
-    process, workers = started(tmp_path, *QUICK)
-    wait_until(lambda: any(tmp_path.glob("*.json")), "a scene was there")
+@pytest.mark.parametrize("more", [QUICK, (*ENDLESS, "--count", 2)], ids=["at work", "as it starts"])
+def test_a_killed_worker_is_told_with_the_cure(more: tuple[object, ...], tmp_path: Path) -> None:
+    process, workers = started(tmp_path, *more)
+    if more == QUICK:
+        wait_until(lambda: any(tmp_path.glob("*.json")), "a scene was there")
     os.kill(workers.pop(), signal.SIGKILL)
     _, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1
