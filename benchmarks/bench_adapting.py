@@ -41,7 +41,7 @@ from pipelines.tiles import Band
 
 CROP = 96  # pixels along the side of a crop
 FEW_MIXED = 0.002  # of the pixels of a crop in which depth does not mix
-TILED = 384  # pixels along the side of a frame made of tiles, at least
+TILED = 768  # pixels along the side of a frame made of tiles, at least
 COMPANIONS = frozenset({"coc", "lens", "motion", "time"})
 
 

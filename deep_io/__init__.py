@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 from deep_io.deep_reader import DeepReader, PathLike
-from deep_io.deep_writer import DeepWriter
+from deep_io.deep_writer import LINE_ORDERS, DeepWriter
 from deep_io.errors import InputError, LbmcError, MemoryCostWarning, UsageError
 from deep_io.header import Channel, Header, read_headers
 from deep_io.samples import DeepSamples, Window
@@ -38,7 +39,11 @@ def write_deep(path: PathLike, samples: DeepSamples, header: Header | None = Non
                threads: int | None = None) -> None:
     """Write samples as a single-part deep scanline file; without a header one is made from the samples.
 
+    A header that was read can be written again: rows have no random order, which tiles may have, so they increase.
     Raises ValueError when samples and header do not fit, OSError from the disk.
     """
-    with DeepWriter(path, header or Header.of_samples(samples), compression, threads) as writer:
+    header = header or Header.of_samples(samples)
+    if header.line_order not in LINE_ORDERS:
+        header = replace(header, line_order="increasing")
+    with DeepWriter(path, header, compression, threads) as writer:
         writer.write(samples)

@@ -1,7 +1,7 @@
 """Outputs that appear whole or not at all, and the rules that refuse one.
 
-`output_action` decides before any work whether a file may be written; `atomic_output` writes beside the target and
-renames. Knows nothing of what is written.
+`output_action` decides before any work whether a file may be written, `Inputs` knows the files it must not be;
+`atomic_output` writes beside the target and renames. Knows nothing of what is written.
 """
 
 from __future__ import annotations
@@ -22,35 +22,51 @@ Existing = Literal["refuse", "overwrite", "skip"]
 MOST_OF_STEM = 40  # characters: a name of the 255 bytes that file systems allow leaves no room for what is added
 
 
-def output_action(target: PathLike, inputs: Iterable[PathLike] = (), existing: Existing = "refuse", *,
+class Inputs:
+    """The files that a job reads, looked up on the disk once, however many outputs are held against them."""
+
+    def __init__(self, paths: Iterable[PathLike] = ()) -> None:
+        self._names: dict[str | tuple[int, int], str] = {}
+        for path in paths:
+            for identity in _identities(path):
+                self._names.setdefault(identity, os.fspath(path))
+
+    def same_as(self, path: PathLike) -> str | None:
+        """The name of the input that `path` is, or is a hard or symbolic link to; None where it is none."""
+        return next((self._names[identity] for identity in _identities(path) if identity in self._names), None)
+
+
+def _identities(path: PathLike) -> Iterator[str | tuple[int, int]]:
+    """What two names of one file have in common: the real path, and device and number where it exists."""
+    yield os.path.realpath(path)
+    with suppress(OSError):
+        found = os.stat(path)
+        yield found.st_dev, found.st_ino
+
+
+def output_action(target: PathLike, inputs: Inputs | Iterable[PathLike] = (), existing: Existing = "refuse", *,
                   can_skip: bool = True) -> bool:
     """Whether `target` is to be written: True, or False where it exists and `existing` is "skip".
 
+    `inputs` are looked up on every call unless they are `Inputs` already, as those of a job with many outputs should.
     `can_skip` tells whether the job's command has --skip-existing, so that a refusal may advise it.
     Raises UsageError when it is one of `inputs` (the same file, a hard or symbolic link to it), when it exists and
     may not be replaced, and when it is a folder; InputError when its folder does not exist or cannot be written.
     """
     path = Path(target)
-    _refuse_inputs(path, inputs)
+    source = (inputs if isinstance(inputs, Inputs) else Inputs(inputs)).same_as(path)
+    if source is not None:
+        raise UsageError(f"{path}: is the input {source} itself; write to another file")
     if path.is_dir():
         raise UsageError(f"{path}: is a folder; name the file to write")
+    exists = os.path.lexists(path)
+    if exists and existing == "skip":  # also where nothing could be written
+        return False
     _require_folder(path)
-    if os.path.lexists(path):
-        if existing == "skip":
-            return False
-        if existing == "refuse":
-            skip = " or --skip-existing to leave it" if can_skip else ""
-            raise UsageError(f"{path}: exists; pass --overwrite to replace it{skip}")
+    if exists and existing == "refuse":
+        skip = " or --skip-existing to leave it" if can_skip else ""
+        raise UsageError(f"{path}: exists; pass --overwrite to replace it{skip}")
     return True
-
-
-def _refuse_inputs(path: Path, inputs: Iterable[PathLike]) -> None:
-    for source in inputs:
-        same = os.path.realpath(source) == os.path.realpath(path)
-        with suppress(OSError):  # one of them does not exist
-            same = same or os.path.samefile(source, path)
-        if same:
-            raise UsageError(f"{path}: is the input {os.fspath(source)} itself; write to another file")
 
 
 def _require_folder(path: Path) -> None:

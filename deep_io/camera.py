@@ -37,11 +37,13 @@ class Camera:
         """(3, 3) M with n_view = n_world @ M up to length; view space has z toward the camera.
 
         Normals go with the inverse transpose of the points' matrix, which also holds for a scaled camera.
-        Raises ValueError when the matrix is unknown or singular.
+        Raises ValueError when the matrix is unknown, singular or not finite.
         """
         if self.world_to_camera is None:
             raise ValueError("the camera has no worldToCamera matrix")
         rotation = self.world_to_camera[:3, :3]
+        if not np.isfinite(rotation).all():
+            raise ValueError("the worldToCamera matrix is not finite")
         if abs(np.linalg.det(rotation)) < 1e-12 * max(1e-300, float(np.abs(rotation).max()) ** 3):
             raise ValueError("the worldToCamera matrix is singular")
         return np.asarray(np.linalg.inv(rotation).T * np.array([1.0, 1.0, -1.0]), np.float64)
@@ -101,7 +103,7 @@ def parse_camera(text: str) -> Camera:
 
 
 def _checked(text: str, matrix: object, angle: object) -> Camera:
-    if angle is not None and not (isinstance(angle, int | float) and 0 < angle < 180):
+    if isinstance(angle, bool) or (angle is not None and not (isinstance(angle, int | float) and 0 < angle < 180)):
         raise UsageError(f"--camera {text}: the field of view must lie between 0 and 180 degrees")
     if matrix is None:
         return Camera(None, angle)
@@ -109,4 +111,6 @@ def _checked(text: str, matrix: object, angle: object) -> Camera:
         values = np.array(matrix, np.float64).reshape(4, 4)
     except (TypeError, ValueError) as error:
         raise UsageError(f"--camera {text}: worldToCamera must be 16 numbers in row order") from error
+    if not np.isfinite(values).all():
+        raise UsageError(f"--camera {text}: worldToCamera must be finite")
     return Camera(values, angle)

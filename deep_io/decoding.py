@@ -39,6 +39,8 @@ _LARGEST_HALF = np.float32(65504)
 # sums and products of such values would overflow. A feature beyond half's range is none either.
 LARGEST_RADIANCE = np.float32(1e30)
 LARGEST_FEATURE = _LARGEST_HALF
+# Files of over and packed form hold no two equal depths in a pixel: a second unknown depth, 0, is stored as 1e-45.
+_SMALLEST_DEPTH = np.finfo(np.float32).tiny
 
 
 @dataclass
@@ -288,9 +290,14 @@ def _cover_by_depth(decoded: Weighted, depth: Values | None, conventions: Conven
 
 
 def _mend(values: Values, role: str, misses: Index, repairs: Counter[str]) -> None:
-    """Set the missing value on misses, which does not count, and on broken values (or a depth below 0), which does."""
+    """Set the missing value on misses and unknown depths, which does not count, and on broken values, which does.
+
+    A depth below 0 is broken.
+    """
     missing = np.float32(ROLES[role].missing)
     values[misses] = missing
+    if role == "depth":
+        values[(values > 0) & (values < _SMALLEST_DEPTH)] = missing
     largest = np.float32(MISS_DEPTH) if role == "depth" else LARGEST_FEATURE
     negative = role == "depth" and bool(values.size) and not values.min() >= 0
     if not negative and _all_within(values, largest):

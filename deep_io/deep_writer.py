@@ -32,6 +32,7 @@ from deep_io.header import (
 )
 from deep_io.samples import DeepSamples, Window
 
+LINE_ORDERS = ("increasing", "decreasing")  # of scanlines; tiles know "random", too
 _DEEP_DATA_VERSION = 1
 _ROWS_AHEAD = 32  # Encoded rows waiting to be written, per call of the thread pool.
 
@@ -132,7 +133,7 @@ class _Part:
     """A part being written: its header, which rows are done and how the next ones are encoded."""
 
     def __init__(self, header: Header, compression: str, small: bool) -> None:
-        if header.line_order not in ("increasing", "decreasing"):
+        if header.line_order not in LINE_ORDERS:
             raise ValueError(f"deep scanlines have no {header.line_order} line order")
         _check_channels(header)
         height = header.data_window.height

@@ -6,6 +6,7 @@ the readers.
 
 from __future__ import annotations
 
+import math
 import os
 import stat
 import struct
@@ -215,6 +216,9 @@ def _header(raw: dict[str, Attribute], flags: int, path: str, index: int) -> Hea
             raise InputError(f"{where}: the header's {name} is beyond what EXR allows: {box}")
         return box
 
+    pixel_aspect = float(required("pixelAspectRatio", "float"))
+    if not 0 < pixel_aspect < math.inf:
+        raise InputError(f"{where}: the header's pixelAspectRatio is {pixel_aspect}; it must be positive and finite")
     kind = raw.pop("type").value if "type" in raw else ("tiledimage" if flags & TILED else "scanlineimage")
     if flags & NON_IMAGE and not flags & MULTI_PART and kind not in DEEP_TYPES:
         raise InputError(f"{where}: the file says it is deep and its header's type is {kind!r}")
@@ -225,7 +229,7 @@ def _header(raw: dict[str, Attribute], flags: int, path: str, index: int) -> Hea
         name=str(raw.pop("name").value) if "name" in raw else "",
         type=str(kind),
         compression=_named(COMPRESSIONS, required("compression", "compression")),
-        pixel_aspect=float(required("pixelAspectRatio", "float")),
+        pixel_aspect=pixel_aspect,
         line_order=_named(LINE_ORDERS, required("lineOrder", "lineOrder")),
         structure={name: raw.pop(name) for name in STRUCTURE if name in raw},
         attributes=raw,

@@ -63,9 +63,9 @@ class SampleReader:
                    alpha is 0 or 1
         normals, depth, camera   see conventions.resolve; camera also as the text of `--camera`
         threads    decoding threads, None for one per core
-    Raises InputError when the file is unreadable, flat, without R, G, B or without any sample, when two layers match
-    one role, when alpha is fractional (on reading) or missing for the weighting, and when a conversion lacks its
-    camera. UsageError for options that make no sense.
+    Raises InputError when the file is unreadable, flat, without R, G, B or without any sample (but under "over", where
+    that is an empty picture), when two layers match one role, when alpha is fractional (on reading) or missing for the
+    weighting, and when a conversion lacks its camera. UsageError for options that make no sense.
     """
 
     def __init__(self, path: PathLike, part: int | str | None = None, overrides: Mapping[str, str] | None = None,
@@ -73,11 +73,11 @@ class SampleReader:
                  camera: Camera | str | None = None, threads: int | None = None) -> None:
         self._reader = DeepReader(path, part, threads)
         try:
-            if self._reader.total == 0:
-                raise InputError(f"{self._reader.path}: there is no sample anywhere")
             self._interpretation = interpretation(
                 self._reader.header, self._reader.path, overrides, weighting, normals, depth,
                 parse_camera(camera) if isinstance(camera, str) else camera)
+            if self._reader.total == 0 and self.weighting != "over":
+                raise InputError(f"{self._reader.path}: there is no sample anywhere")
         except BaseException:
             self._reader.close()
             raise
@@ -85,6 +85,11 @@ class SampleReader:
     @property
     def path(self) -> str:
         return self._reader.path
+
+    @property
+    def part(self) -> int:
+        """The number of the part that is read."""
+        return self._reader.part
 
     @property
     def header(self) -> Header:

@@ -21,7 +21,7 @@ PathLike = str | os.PathLike[str]
 
 # What stands for the frame number in a file's name. An @ inside a word, as in user@host.exr, does not.
 _NUMBER = re.compile(r"#+|@+(?![A-Za-z0-9@])|(?:%0?(?P<printf>\d*)d|\$F(?P<houdini>\d*))(?![A-Za-z])")
-_RANGE_BEFORE = re.compile(r"(?:^|(?<=[^A-Za-z0-9,:-]))(?P<range>\d+[-\d,x:]*)$")
+_RANGE_BEFORE = re.compile(r"(?:^|(?<=[^A-Za-z0-9,:-]))(?P<range>\d+(?:[-\d,x:]*\d)?)$")
 
 
 @dataclass(frozen=True)
@@ -70,17 +70,21 @@ def is_sequence(path: PathLike) -> bool:
     return has_pattern(path) and not os.path.exists(path)
 
 
-def parse_frames(text: str) -> list[int]:
-    """The frames of `--frames`, in the order given, each once: "1001-1100x2", "1,3,7-9". Raises UsageError."""
+def parse_frames(text: str, given: str = "") -> list[int]:
+    """The frames of a range, in the order given, each once: "1001-1100x2", "1,3,7-9".
+
+    Raises UsageError, which quotes `given`: what the user wrote to name the range, `text` alone by default.
+    """
+    given = given or repr(text)
     try:
         found = list(FrameSet(text))
         frames = [int(frame) for frame in found]
         if frames != found:
             raise ValueError("frames are whole numbers")
     except (ValueError, TypeError) as error:
-        raise UsageError(f"--frames {text}: not a frame range; write 1001-1100, 1001-1100x2 or 1,3,7-9") from error
+        raise UsageError(f"{given}: not a frame range; write 1001-1100, 1001-1100x2 or 1,3,7-9") from error
     if not frames:
-        raise UsageError(f"--frames {text}: names no frame")
+        raise UsageError(f"{given}: names no frame")
     return frames
 
 
@@ -108,8 +112,12 @@ def expand(source: PathLike, frames: str | None = None) -> list[Frame]:
             raise InputError(f"{os.fspath(source)}: {_why_no_file(source)}")
         return [Frame(None, Path(source))]
     pattern = _parse(source)
-    wanted = frames if frames is not None else pattern.frames
-    numbers = parse_frames(wanted) if frames is not None or wanted else _on_disk(source, pattern)
+    if frames is not None:
+        numbers = parse_frames(frames, f"--frames {frames}")
+    elif pattern.frames:
+        numbers = parse_frames(pattern.frames, f"{os.fspath(source)}: {pattern.frames}")
+    else:
+        numbers = _on_disk(source, pattern)
     found = [Frame(number, pattern.frame(number)) for number in numbers]
     missing = [frame for frame in found if not frame.source.is_file()]
     if missing:

@@ -5,8 +5,9 @@
 #     examples/farm_chunk.sh 'noisy.####.exr' 'beauty.####.exr' 1011 1020 1001
 #
 # A job by itself measures the exposure on its first frame. Chunks would each measure on another frame, and the picture
-# could step at their borders; --exposure-from takes the same frame for all. The frame KEY must be on disk, whether or
-# not it belongs to the chunk.
+# could step at their borders; --exposure-from takes the same frame for all, also for the number of layers and the roles
+# that say nothing. The frame KEY must be on disk, whether or not it belongs to the chunk, and so must all of FIRST to
+# LAST: where one is missing the task ends with 3 and writes none, so make it depend on the renders of all of them.
 #
 # OpenCue    the command of a layer:   farm_chunk.sh IN OUT #FRAME_START# #FRAME_END# 1001
 # Deadline   the arguments of a CommandLine job:   IN OUT <STARTFRAME> <ENDFRAME> 1001

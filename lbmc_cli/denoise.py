@@ -29,7 +29,7 @@ def denoise(**choices: Any) -> int:
     """Denoise IN, a deep EXR whose samples are path samples, to the flat EXR OUT.
 
     IN and OUT may be sequences: shot.####.exr, shot.%04d.exr, shot.$F4.exr. Exit codes: 0 done, 1 some frames failed,
-    2 usage or refused output, 3 IN unreadable or unsuitable.
+    2 usage or refused output, 3 IN unreadable or unsuitable, or a frame of --frames missing (then none is written).
     """
     options = build_options(DenoiseOptions, **job_choices(**choices))
     from pipelines.frames import find_frames

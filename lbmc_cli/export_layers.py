@@ -32,7 +32,8 @@ from pipelines.options import COMPRESSIONS
 @option(
     "--samples",
     is_flag=True,
-    help="Instead of layers, copy the samples of IN with each one's share in every layer: layer0.weight ...",
+    help="Instead of layers, copy the samples of IN with each one's share in every layer: layer0.weight ... Goes with "
+    "none of --form, --contributions, --aov and --ids.",
 )
 @job_options
 @option(

@@ -21,7 +21,7 @@ def info(source: str, as_json: bool, part: str | None, **choices: Any) -> None:
     from pipelines.info import FileInfo, RefusedFile, file_info, refused_file
 
     def show(found: FileInfo | RefusedFile) -> None:
-        click.echo(json.dumps(found.as_dict(), indent=2) if as_json else "\n".join(found.lines()))
+        click.echo(json.dumps(found.as_dict(), indent=2, allow_nan=False) if as_json else "\n".join(found.lines()))
 
     try:
         show(file_info(source, part=part_choice(part), **choices))

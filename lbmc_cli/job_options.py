@@ -48,9 +48,13 @@ job_options = together(
     option(
         "--exposure",
         type=click.FloatRange(0.0, min_open=True),
-        help="Scale of the radiance before the network.  [default: measured]",
+        help="Scale of the radiance before the network; fixes nothing else.  [default: measured]",
     ),
-    option("--exposure-from", metavar="FRAME|FILE", help="Frame whose exposure and depth scale serve all."),
+    option(
+        "--exposure-from",
+        metavar="FRAME|FILE",
+        help="Frame that decides for all: exposure, depth scale, number of layers, roles held.  [default: the first]",
+    ),
     option(
         "--aov",
         "aovs",
@@ -62,8 +66,8 @@ job_options = together(
         "--ids",
         multiple=True,
         metavar="NAME",
-        help="Also write this id channel of IN with the beauty, as ranked pairs (id, weight) the Cryptomatte way. "
-        "Repeatable.",
+        help="Also write this id channel of IN with the beauty, as ranked pairs (id, weight) the Cryptomatte way; "
+        "export-layers: with --form parts or channels. Repeatable.",
     ),
     reading_options,
 )

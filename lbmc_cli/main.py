@@ -5,6 +5,7 @@ Nothing heavy is imported here: a subcommand's module is imported when it runs, 
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import sys
@@ -14,7 +15,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import click
 
@@ -104,6 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0 done; 1 some frames failed, or an unexpected error; 2 usage or a refused output; 3 an unreadable or unsuitable
     input; 130 and 143 after SIGINT and SIGTERM. Errors are one line on stderr that starts with `ERROR:`.
     """
+    _take_any_text(sys.stdout, sys.stderr)
     try:
         refuse_shadowed_packages()
     except click.ClickException as error:
@@ -144,6 +146,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from pipelines.jobs import describe_error
 
         return _report(describe_error(error), getattr(error, "exit_code", EXIT_FAILED))
+
+
+def _take_any_text(*streams: TextIO) -> None:
+    """Lets streams print what they cannot encode as escapes: names and header text need not be UTF-8."""
+    for stream in streams:
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _report(text: str, code: int) -> int:

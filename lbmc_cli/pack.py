@@ -17,7 +17,8 @@ from lbmc_cli.report import end_job, existing_choice
 @option("--frames", metavar="RANGE", help="Frames of a sequence, e.g. 1001-1100x2.  [default: those on disk]")
 @option("--overwrite", is_flag=True, help="Replace outputs that exist.")
 @option("--skip-existing", is_flag=True, help="Leave outputs that exist and count them as done.")
-@option("--layer", "layers", multiple=True, metavar="NAME", help="Also carry this light or lobe layer. Repeatable.")
+@option("--layer", "layers", multiple=True, metavar="NAME",
+        help="Also carry this light or lobe layer, beside the roles. Repeatable.")
 @mapping_options
 @option(
     "--pixel-type",

@@ -44,8 +44,8 @@ def render(
 ) -> int:
     """Render training examples into the folder OUTDIR: NAME.deep.exr, NAME.ref.exr and NAME.json each.
 
-    Needs Mitsuba 3 (pip install 'lbmc[render]') and LLVM 17 or newer. Examples that are there already are kept, so a
-    job that was stopped goes on where it was; the same seed gives the same example.
+    Needs LLVM 17 or newer, and Mitsuba 3, which comes with the extra 'render' of lbmc. Examples that are there already
+    are kept, so a job that was stopped goes on where it was; the same seed gives the same example.
     """
     from pipelines.rendering.job import RenderOptions, render_scenes
     from pipelines.rendering.shots import RenderSettings

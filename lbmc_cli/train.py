@@ -14,7 +14,7 @@ from lbmc_cli.options import LbmcCommand, option
 @click.argument("data", type=click.Path(path_type=Path))
 @click.argument("out", type=click.Path(path_type=Path))
 @option("--validation", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Held-out scenes.")
-@option("--network", default="fast", show_default=True, help="Which network to train.")
+@option("--network", metavar="NAME", help="Which network to train.  [default: that of --start, else fast]")
 @option("--recipe", type=click.Path(path_type=Path), metavar="FILE", help="JSON file with fields of the recipe.")
 @option("--steps", type=click.IntRange(1), help="Length of the run.  [default: 4000]")
 @option("--batch", type=click.IntRange(1), help="Crops a step, of all processes together.  [default: 4]")

@@ -179,6 +179,8 @@ FAST = Config(
     partitioner=(24, 16),
     generator=(48, 48),
     kernel_sizes=(5, 3, 3, 3, 3, 3),
+    guide_gates=3,
+    divisor_features=4,
 )
 
 CONFIGS: Mapping[str, Config] = {

@@ -106,7 +106,19 @@ class Denoiser(nn.Module):
     @property
     def reach(self) -> int:
         """Pixels: nothing farther than this from a pixel changes it."""
-        return influence(self.config, self.stride, PRIOR_WINDOW // 2 if self.config.depth_prior else 0)
+        return influence(self.config, self.stride, self._statistics_reach)
+
+    @property
+    def tile_reach(self) -> int | None:
+        """The same for a tile that is given what `decoded_context` made of the whole picture. None: it cannot be, for
+        direct kernels are made of every level of the context."""
+        if self.config.kernel == "direct":
+            return None
+        return influence(self.config, self.stride, self._statistics_reach, decoded=True)
+
+    @property
+    def _statistics_reach(self) -> int:
+        return PRIOR_WINDOW // 2 if self.config.depth_prior else 0
 
     @property
     def stride(self) -> int:
@@ -114,7 +126,7 @@ class Denoiser(nn.Module):
         return max(self.config.unet.stride, 1 << (len(self.config.kernel_sizes) - 1))
 
     def forward(self, samples: Samples, scale: FrameScale, layers: int | None = None, fill: bool = True,
-                wanted: Tensor | None = None) -> Layers:
+                wanted: Tensor | None = None, decoded: Tensor | None = None) -> Layers:
         """Denoises a batch of pictures.
 
         Parameters
@@ -125,6 +137,8 @@ class Denoiser(nn.Module):
         fill : fill targets that no sample reaches (`fill_holes`); a caller with tiles does that for the whole frame
         wanted : (B, H, W) bool; pixels whose result will be used, at least one. What is computed of the others is not
             said; all samples count all the same. None: every pixel
+        decoded : these pixels' part, padded to the stride, of the `decoded_context` of a larger picture, so that its
+            halo need not be wider than `tile_reach`
 
         Returns
         -------
@@ -138,7 +152,7 @@ class Denoiser(nn.Module):
             wanted = None
         seen = None if wanted is None else sources_of(wanted, config.kernel_sizes)
         relative = self._surroundings(samples, scale)
-        contexts, embedding = self._context(samples, relative, scale, seen)
+        contexts, embedding = self._context(samples, relative, scale, seen, decoded)
         context = _rows(contexts[0], samples.shape)  # (P, C)
         if config.variant == "sample_splat":
             visible = self._splat_samples(samples, embedding, context, scale)
@@ -149,13 +163,14 @@ class Denoiser(nn.Module):
         result = to_layers(visible)
         return fill_holes(result) if fill else result
 
-    def partition(self, samples: Samples, scale: FrameScale, layers: int | None = None) -> Tensor:
+    def partition(self, samples: Samples, scale: FrameScale, layers: int | None = None, decoded: Tensor | None = None
+                  ) -> Tensor:
         """(N, L): how each sample is shared among the layers, front first; rows sum to 1. As in `forward`."""
         keep = kept_logits(layers or self.config.layers, self.config.partition_logits)
         if not self.config.layered:
             return torch.ones_like(samples.weight[:, None])
         relative = self._surroundings(samples, scale)
-        contexts, _ = self._context(samples, relative, scale)
+        contexts, _ = self._context(samples, relative, scale, decoded=decoded)
         context = _rows(contexts[0], samples.shape)
         shares = []
         for part in chunks(samples, relative):
@@ -177,12 +192,18 @@ class Denoiser(nn.Module):
 
     # --- context ---------------------------------------------------------------------------------------------------
 
-    def _context(self, samples: Samples, relative: Tensor | None, scale: FrameScale, seen: Tensor | None = None
-                 ) -> tuple[list[Tensor], Tensor]:
-        """Context pictures, finest first, of the size padded to the stride; the embeddings (n, E) of the last chunk.
+    def unet_inputs(self, samples: Samples, scale: FrameScale) -> Tensor:
+        """(B, C, h, w) what the U-Net sees, at its own resolution; the pixels are padded to the stride before."""
+        picture, _ = self._inputs(samples, self._surroundings(samples, scale), scale)
+        return self.unet.pooled(picture)
 
-        `seen` : (B, H, W) bool, pixels whose context will be used; None: all
-        """
+    def decoded_context(self, inputs: Tensor) -> Tensor:
+        """(B, C, h, w) `unet_inputs` of a whole picture -> what the U-Net decodes of them, for its tiles."""
+        return self.unet.decoded(inputs)[-1]
+
+    def _inputs(self, samples: Samples, relative: Tensor | None, scale: FrameScale) -> tuple[Tensor, Tensor]:
+        """The picture (B, C, H, W) that the context is made of, padded to the stride; the embeddings (n, E) of the last
+        chunk."""
         rows = []
         for part in chunks(samples, relative):
             embedding = self.reducer(part.samples, scale)
@@ -191,9 +212,18 @@ class Denoiser(nn.Module):
         picture = together(rows, samples.counts.numel()).view(batch, height, width, -1)
         picture = picture.permute(0, 3, 1, 2)  # channels last in memory
         stride = self.config.unet.stride
-        padded = F.pad(picture, (0, -width % stride, 0, -height % stride))
+        return F.pad(picture, (0, -width % stride, 0, -height % stride)), embedding
+
+    def _context(self, samples: Samples, relative: Tensor | None, scale: FrameScale, seen: Tensor | None = None,
+                 decoded: Tensor | None = None) -> tuple[list[Tensor], Tensor]:
+        """Context pictures, finest first, of the size padded to the stride; the embeddings (n, E) of the last chunk.
+
+        `seen` : (B, H, W) bool, pixels whose context will be used; None: all. With `decoded` there is the finest alone
+        """
+        picture, embedding = self._inputs(samples, relative, scale)
         box = None if seen is None else box_of(seen)
-        return [level.to(picture.dtype) for level in reversed(self.unet.levels(padded, box))], embedding
+        levels = self.unet.levels(picture, box) if decoded is None else [self.unet.finished(picture, decoded, box)]
+        return [level.to(picture.dtype) for level in reversed(levels)], embedding
 
     # --- samples to layers -----------------------------------------------------------------------------------------
 

@@ -1,7 +1,8 @@
 """Per-sample features: what the sample reducer sees of each role, and the divisor of albedo demodulation.
 
 Radiance enters relative to the frame's exposure, depth relative to the frame's median hit depth, pixel quantities
-(motion, circle of confusion) squashed by x / (4 + |x|). Features of a miss are never read: they are set to 0.
+(motion, circle of confusion) squashed by x / (4 + |x|). Of a miss only the radiance is read from a file; its other
+features are 0, that of time, which is centred, -1/2.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def held_groups(samples: Samples) -> set[str]:
 
 
 def encode(samples: Samples, scale: FrameScale, groups: Iterable[str]) -> dict[str, Tensor]:
-    """Feature groups of those named that these samples have: name -> (N, width), all finite, 0 on a miss."""
+    """Feature groups of those named that these samples have: name -> (N, width), all finite."""
     roles = samples.roles
     hit = (samples.coverage > 0)[:, None]  # (N, 1)
     out: dict[str, Tensor] = {}
@@ -94,9 +95,9 @@ def _encode_role(role: str, values: Tensor, hit: Tensor, scale: FrameScale) -> T
     if role in ("motion", "coc"):
         return _squash(torch.where(hit, values, 0))
     if role == "lens":
-        return values  # where the ray left the lens is known for a miss, too
+        return values  # 0 on a miss, as it is read
     if role == "time":
-        return values - 0.5
+        return values - 0.5  # -1/2 on a miss, whose time is read as 0: trained networks know it so
     return torch.where(hit, values, 0)
 
 

@@ -129,18 +129,23 @@ class _Fine(nn.Module):
     def forward(self, picture: Tensor, context: Tensor, box: Box | None = None) -> Tensor:
         """picture (B, inputs, H, W), context (B, C, H / scale, W / scale) -> (B, C, H, W).
 
-        `box` : nothing is added elsewhere; not with a gradient
+        `box` : elsewhere the result is 0
         """
-        size = picture.shape[-2:]
-        enlarged, hidden = _enlarged(context, size), _enlarged(self.from_context(context), size)
+        scale = picture.shape[-1] // context.shape[-1]
         if box is None:
-            return enlarged + self._added(picture, hidden)
-        halo = len(self.block.convolutions)
-        top, left = (max(side.start - halo, 0) for side in box)
-        wide = (..., slice(top, box[0].stop + halo), slice(left, box[1].stop + halo))
+            return self._refined(picture, context, scale)
+        halo = len(self.block.convolutions) + scale  # so far do pixels, and the edge of what is enlarged, reach
+        rows, cols = (slice(max(side.start - halo, 0) // scale, -(-(side.stop + halo) // scale)) for side in box)
+        top, left = rows.start * scale, cols.start * scale
+        near = picture[..., top : rows.stop * scale, left : cols.stop * scale]
+        refined = self._refined(near, context[..., rows, cols], scale)
+        result = refined.new_zeros(*refined.shape[:2], *picture.shape[-2:])
         inside = (..., slice(box[0].start - top, box[0].stop - top), slice(box[1].start - left, box[1].stop - left))
-        enlarged[..., box[0], box[1]] += self._added(picture[wide], hidden[wide])[inside]
-        return enlarged
+        result[..., box[0], box[1]] = refined[inside]
+        return result
+
+    def _refined(self, picture: Tensor, context: Tensor, scale: int) -> Tensor:
+        return _enlarged(context, scale) + self._added(picture, _enlarged(self.from_context(context), scale))
 
     def _added(self, picture: Tensor, hidden: Tensor) -> Tensor:
         x = self.block(F.leaky_relu_(self.from_picture(picture) + hidden, LEAK))
@@ -148,8 +153,8 @@ class _Fine(nn.Module):
         return added
 
 
-def _enlarged(x: Tensor, size: Sequence[int]) -> Tensor:
-    return F.interpolate(x, size=tuple(size), mode="bilinear", align_corners=False)
+def _enlarged(x: Tensor, scale: int) -> Tensor:
+    return F.interpolate(x, scale_factor=scale, mode="bilinear", align_corners=False)
 
 
 class UNet(Products):
@@ -173,35 +178,39 @@ class UNet(Products):
         self.head = _Block(below, config.head)
         self.fine = _Fine(inputs, config.out_channels, config.fine) if config.fine else None
 
-    def forward(self, x: Tensor) -> Tensor:
-        return self.levels(x)[-1]
+    def forward(self, picture: Tensor) -> Tensor:
+        return self.levels(picture)[-1]
 
-    def levels(self, x: Tensor, box: Box | None = None) -> list[Tensor]:
-        """The decoder's outputs, coarsest first; the last one has been through the head and has the input's size.
+    def levels(self, picture: Tensor, box: Box | None = None) -> list[Tensor]:
+        """The decoder's outputs, coarsest first; the last one is `finished`, the context."""
+        *coarser, last = self.decoded(self.pooled(picture))
+        return [*coarser, self.finished(picture, last, box)]
 
-        `box` : where the last one is wanted; what is cheap to leave out elsewhere is. Not with a gradient.
-        """
+    def pooled(self, picture: Tensor) -> Tensor:
+        """The picture at the resolution that the network works at."""
+        return F.avg_pool2d(picture, self.config.scale) if self.config.scale > 1 else picture
+
+    def decoded(self, x: Tensor) -> list[Tensor]:
+        """Of a pooled picture the decoder's outputs, coarsest first; the last one has been through the head."""
         with self.products(x):
-            return self._levels(x, box)
+            skips, outputs = [], []
+            for block in self.encoder:
+                skips.append(x)
+                x = F.max_pool2d(block(x), 2)
+            x = self.bottleneck(x)
+            for block, skip in zip(self.decoder, reversed(skips), strict=True):
+                x = block(torch.cat([_enlarged(x, 2), skip], 1))
+                outputs.append(x)
+            outputs[-1] = self.head(x)
+            return outputs
 
-    def _levels(self, x: Tensor, box: Box | None) -> list[Tensor]:
-        picture = x
-        if self.config.scale > 1:
-            x = F.avg_pool2d(x, self.config.scale)
-        skips = []
-        for block in self.encoder:
-            skips.append(x)
-            x = F.max_pool2d(block(x), 2)
-        x = self.bottleneck(x)
-        outputs = []
-        for block, skip in zip(self.decoder, reversed(skips), strict=True):
-            x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
-            x = block(torch.cat([x, skip], 1))
-            outputs.append(x)
-        x = self.head(x)
-        if self.fine is not None:
-            x = self.fine(picture, x, box)
-        elif self.config.scale > 1:
-            x = _enlarged(x, picture.shape[-2:])
-        outputs[-1] = x
-        return outputs
+    def finished(self, picture: Tensor, decoded: Tensor, box: Box | None = None) -> Tensor:
+        """The last of `decoded` at the picture's resolution.
+
+        `box` : where it is wanted; elsewhere it may be 0
+        """
+        with self.products(picture):
+            if self.fine is not None:
+                context: Tensor = self.fine(picture, decoded, box)
+                return context
+            return _enlarged(decoded, self.config.scale) if self.config.scale > 1 else decoded

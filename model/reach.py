@@ -43,11 +43,14 @@ def unet_span(span: Span, unet: UNetConfig, level: int = 0) -> Span:
     Level 0 is the network's own output, upsampled from 1/scale; levels above 0 exist for scale 1.
     """
     if level == 0:
-        span = _grow(span, max(len(unet.fine) - 1, 0))  # the first is 1x1
-        if unet.scale > 1:
-            span = _bilinear(span, unet.scale)
-        span = _grow(span, len(unet.head))
+        span = _grow(_finished(span, unet), len(unet.head))
     return _pixels(_decoded(span, unet, level), unet.scale)
+
+
+def _finished(span: Span, unet: UNetConfig) -> Span:
+    """Pixels of the decoder's last output, at 1/scale of the picture's resolution, that the context sees."""
+    span = _grow(span, max(len(unet.fine) - 1, 0))  # the first is 1x1
+    return _bilinear(span, unet.scale) if unet.scale > 1 else span
 
 
 def _decoded(span: Span, unet: UNetConfig, level: int) -> Span:
@@ -63,18 +66,26 @@ def _encoded(span: Span, unet: UNetConfig, level: int) -> Span:
     return _encoded(_grow(_pixels(span, 2), len(unet.encoder[level - 1])), unet, level - 1)
 
 
-def _output_span(x: int, config: Config, halo: int) -> Span:
-    """Input pixels that output pixel x sees; `halo`: how far the per-pixel statistics look by themselves."""
+def _output_span(x: int, config: Config, halo: int, decoded: bool) -> Span:
+    """Input pixels that output pixel x sees.
+
+    halo : how far the per-pixel statistics look by themselves
+    decoded : whether what the U-Net decodes is given
+    """
+    def context(span: Span) -> Span:
+        unet = config.unet
+        return _pixels(_finished(span, unet), unet.scale) if decoded else unet_span(span, unet)
+
     target = (x, x)
-    seen = [unet_span(target, config.unet)]
+    seen = [context(target)]
     if config.demodulation:
         sources = _grow(target, DIVISOR_WINDOW // 2)
-        seen += [sources, unet_span(sources, config.unet)]
+        seen += [sources, context(sources)]
     for level, window in enumerate(config.kernel_sizes):
         size = 2**level
         if config.kernel == "affinity":  # targets keep their full resolution, and so do predictions
             sources = _pixels(_grow(_cells(target, size), window // 2), size)
-            seen.append(unet_span(sources, config.unet))
+            seen.append(context(sources))
         else:
             own = target if level == 0 else _bilinear(target, size)
             cells = _grow(own, window // 2)
@@ -82,12 +93,15 @@ def _output_span(x: int, config: Config, halo: int) -> Span:
             seen.append(unet_span(own if config.variant == "pixel_gather" else cells, config.unet, level))
         seen.append(sources)
         if config.layered:  # samples of the sources are partitioned by the context at full resolution
-            seen.append(unet_span(sources, config.unet))
+            seen.append(context(sources))
     return _grow(_union(*seen), halo)
 
 
 @lru_cache(maxsize=8)
-def influence(config: Config, stride: int, halo: int) -> int:
-    """Pixels: nothing farther than this from a pixel changes it, if tiles start at multiples of `stride`."""
-    spans = ((x, _output_span(x, config, halo)) for x in range(stride))
+def influence(config: Config, stride: int, halo: int, decoded: bool = False) -> int:
+    """Pixels: nothing farther than this from a pixel changes it, if tiles start at multiples of `stride`.
+
+    decoded : and if they are given what the U-Net decodes of the whole picture; for affinity kernels
+    """
+    spans = ((x, _output_span(x, config, halo, decoded)) for x in range(stride))
     return max(max(x - first, last - x) for x, (first, last) in spans)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,12 +15,12 @@ import numpy.typing as npt
 from deep_io.errors import InputError
 from deep_io.header import Header
 from deep_io.roles import MISS_DEPTH, ROLES, RoleMap
+from pipelines.channel_names import id_channels, is_colored, layers_of
 from pipelines.inference import FrameLayers
 
 FloatArray = npt.NDArray[np.float32]
-_COLOR_SUFFIXES = (("R", "G", "B"), ("r", "g", "b"), ("red", "green", "blue"))
-_OTHER_SUFFIXES = (("X", "Y", "Z"), ("x", "y", "z"), ("X", "Y"), ("x", "y"), ("u", "v"))
-CRYPTOMATTE = "cryptomatte/"
+BEAUTY = ("R", "G", "B", "A")  # what the beauty is called in an output, whatever it is called in the input
+LAYER_DEPTH = "Z"  # what the layers' own depth is called
 
 
 @dataclass(frozen=True)
@@ -64,19 +63,27 @@ def find_aovs(names: Sequence[str], header: Header, mapping: RoleMap, source: st
     """The groups that names ask for: a layer, a single channel or a role.
 
     Raises InputError for a name that is none of them (the message lists those there are), for the beauty's own
-    channels and for ids.
+    channels, for ids and for a name that the output has already.
     """
-    groups = []
+    groups: list[Aov] = []
+    ids = id_channels(header)
+    written: dict[str, str] = {}  # output channel -> the --aov that it is
     for name in dict.fromkeys(names):
         group = _group(name, header.channel_names, mapping)
         if group is None:
             raise InputError(f"{source}: no AOV {name!r}; there are {', '.join(_there_are(header, mapping)) or 'none'}")
         channels, outputs = group
-        _refuse_ids(name, channels, header, source)
+        owner = next((ids[channel] for channel in channels if channel in ids), None)
+        if owner is not None:
+            raise InputError(f"{source}: {name!r} holds ids, and a filtered id is no id; --ids {owner} writes ranked "
+                             f"pairs of id and weight")
         own = {*mapping["radiance"].channels, *(mapping["coverage"].channels if "coverage" in mapping else ())}
         if own & set(channels):
             raise InputError(f"{source}: {name!r} is the beauty itself, which is written in any case")
-        groups.append(Aov(channels, outputs, _kind(channels, mapping)))
+        aov = Aov(channels, outputs, _kind(channels, mapping))
+        _refuse_taken(name, aov, written, source)
+        written |= dict.fromkeys(_written_by(aov), name)
+        groups.append(aov)
     return Aovs(tuple(groups))
 
 
@@ -97,26 +104,6 @@ def mean_depth(layers: FrameLayers) -> FloatArray:
     return mean
 
 
-def cryptomatte_names(header: Header) -> tuple[str, ...]:
-    """The names of the Cryptomattes that a header's metadata describe."""
-    return tuple(str(header.get(key)) for key in header.attributes
-                 if key.startswith(CRYPTOMATTE) and key.endswith("/name"))
-
-
-def layers_of(channels: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Layer name -> its channels: R, G, B or X, Y, Z in that order where it has them, else all as they come."""
-    suffixes: dict[str, list[str]] = {}
-    for channel in channels:
-        layer, dot, suffix = channel.rpartition(".")
-        if dot:
-            suffixes.setdefault(layer, []).append(suffix)
-    found = {}
-    for layer, there in suffixes.items():
-        order = next((order for order in (*_COLOR_SUFFIXES, *_OTHER_SUFFIXES) if set(order) <= set(there)), there)
-        found[layer] = tuple(f"{layer}.{suffix}" for suffix in order)
-    return found
-
-
 def _group(name: str, channels: Sequence[str], mapping: RoleMap) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
     if name in channels:
         return (name,), (name,)
@@ -132,25 +119,28 @@ def _kind(channels: tuple[str, ...], mapping: RoleMap) -> str:
     if "depth" in mapping and channels == mapping["depth"].channels:
         return "depth"
     roles = {name for source in mapping.sources.values() for name in source.channels}
-    colored = tuple(channel.rpartition(".")[2] for channel in channels) in _COLOR_SUFFIXES
-    return "light" if colored and not roles & set(channels) else "data"
+    return "light" if is_colored(channels) and not roles & set(channels) else "data"
 
 
 def _there_are(header: Header, mapping: RoleMap) -> list[str]:
     own = {*mapping["radiance"].channels, *(mapping["coverage"].channels if "coverage" in mapping else ())}
     others = [name for name in header.channel_names if name not in own]
-    layers = [layer for layer, channels in layers_of(others).items() if not _id_channels(channels, header)]
-    single = [name for name in others if "." not in name and not _id_channels((name,), header)]
-    return [*layers, *single]
+    ids = id_channels(header)
+    layers = [layer for layer, channels in layers_of(others).items() if not ids.keys() & set(channels)]
+    return [*layers, *(name for name in others if "." not in name and name not in ids)]
 
 
-def _id_channels(channels: tuple[str, ...], header: Header) -> bool:
-    types: Mapping[str, Any] = {channel.name: channel.dtype for channel in header.channels}
-    cryptomattes = cryptomatte_names(header)
-    return any(types[name].kind == "u" or name.startswith(cryptomattes) for name in channels)
+def _refuse_taken(name: str, aov: Aov, written: Mapping[str, str], source: str) -> None:
+    """Raises InputError where a channel that an AOV writes is the beauty's, the layers' depth or another AOV's."""
+    for output in _written_by(aov):
+        if output in BEAUTY or (output == LAYER_DEPTH and aov.kind != "depth"):
+            whose = "beauty" if output in BEAUTY else "depth"
+            raise InputError(f"{source}: --aov {name}: {output} is the {whose}'s name in an output; leave it out")
+        if output in written:
+            raise InputError(f"{source}: --aov {name}: {output} is written by --aov {written[output]} already; leave "
+                             f"one of them out")
 
 
-def _refuse_ids(name: str, channels: tuple[str, ...], header: Header, source: str) -> None:
-    if _id_channels(channels, header):
-        raise InputError(f"{source}: {name!r} holds ids, and a filtered id is no id; --ids {name} writes ranked pairs "
-                         f"of id and weight")
+def _written_by(aov: Aov) -> tuple[str, ...]:
+    """The output channels that belong to an AOV alone. There is one depth, so two would be LAYER_DEPTH twice."""
+    return (*aov.outputs, LAYER_DEPTH) if aov.kind == "depth" else aov.outputs

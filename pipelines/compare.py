@@ -115,7 +115,7 @@ def compare_frames(options: CompareOptions) -> JobReport[Comparison]:
 
     with make_progress(options.progress if len(frames) > 1 else "none", len(frames)) as progress:
         if options.flip and not flip_installed():
-            progress.note("FLIP is left out: flip-evaluator is not installed; pip install 'lbmc[bench]' brings it")
+            progress.note("FLIP is left out: flip-evaluator is not installed; install lbmc with its extra 'bench'")
         return run_frames(frames, work, progress)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,10 +19,11 @@ import numpy.typing as npt
 import torch
 
 from deep_io import sequences
-from deep_io.atomic import atomic_output, output_action
+from deep_io.atomic import Inputs, atomic_output, output_action
 from deep_io.errors import InputError, LbmcError, UsageError
 from deep_io.flat import to_half, write_flat
 from deep_io.header import Header
+from deep_io.path_samples import PathSamples
 from model.denoiser import Denoiser
 from model.features import FrameScale
 from pipelines import __version__
@@ -39,7 +40,7 @@ from pipelines.options import DenoiseOptions
 from pipelines.plan import FramePlan, Shot, fit
 from pipelines.progress import Progress, make_progress
 from pipelines.survey import Survey, survey
-from pipelines.tiles import DEFAULT_MEMORY
+from pipelines.tiles import default_memory
 
 KEEP_BLOCK_BYTES = 64 << 20
 SURVEY_SHARE = 0.15  # of a frame's progress
@@ -67,7 +68,7 @@ class Job:
             torch.set_num_threads(options.threads)
         self.net: Denoiser = load_network(self.weights).to(self.device)
         self.net.set_product_dtype(product_dtype(options.precision, self.device))
-        self.memory = options.memory or DEFAULT_MEMORY
+        self.memory = options.memory or default_memory()
         if options.layers is not None and options.layers > self.net.config.partition_logits:
             raise UsageError(f"--layers {options.layers}: {self.weights.name} has up to "
                              f"{self.net.config.partition_logits}")
@@ -95,13 +96,13 @@ class Job:
         return reader
 
     def plan(self, source: Path, reader: FrameReader, update: Callable[[float], None]) -> FramePlan:
-        """Surveys a frame and decides; the first frame decides for the shot."""
+        """Surveys a frame and decides; the first frame that holds samples decides for the shot."""
         window = reader.header.data_window
         aovs = find_aovs(self.options.aovs, reader.header, reader.mapping, os.fspath(source))
         ids = find_ids(self.options.ids, reader.header, os.fspath(source))
         kept = find_kept(reader.header, reader.weighting, self.options.keep, os.fspath(source))
         reader.carry(aovs.channels("light"), aovs.channels("data"))
-        room = fit(reader, self.net.reach, self.net.stride, self.memory)
+        room = fit(reader, self.net, self.options.layers or self.net.config.layers, self.memory)
         if room.keep and not self.options.dry_run:
             reader.keep()
         rows = 0
@@ -113,21 +114,20 @@ class Job:
                 yield block
                 update(SURVEY_SHARE * rows / window.height)
 
-        seen = survey(counted(), reader.header.display_window)
-        if seen.samples == 0:
-            raise InputError(f"{source}: no sample has a finite radiance; render the frame again")
-        if self.shot is None:
-            self.shot = self._decide(source, seen, reader.weighting)
-        if reader.weighting != self.shot.weighting:
-            raise InputError(f"{source}: weighting {reader.weighting}, but the first frame has {self.shot.weighting}; "
+        seen = surveyed(source, counted(), reader)
+        shot = self.shot or self._decide(source, seen, reader.weighting)
+        if reader.total:  # a frame without samples is like none other of the shot
+            self.shot = shot
+        if reader.weighting != shot.weighting:
+            raise InputError(f"{source}: weighting {reader.weighting}, but the first frame has {shot.weighting}; "
                              f"pass --weighting for the whole sequence")
-        held = self.shot.decided.held | (zero_roles(seen) if self.options.adapt else frozenset())
+        held = shot.decided.held | (zero_roles(seen) if self.options.adapt else frozenset())
         present = tuple(role for role in self.net.config.roles if role in reader.mapping)
         roles = tuple(role for role in present if role not in held)
         if aovs.depth is not None and "depth" not in roles:
             raise UsageError(f"--aov {aovs.depth}: {self.weights.name} was trained without depth; choose another model")
         reader.forget(reader.mapping.sources.keys() - {*roles, "coverage"})
-        return FramePlan(source, seen, self.shot, roles, room.bands, room.memory, reader.mapping.lines(), aovs, ids,
+        return FramePlan(source, seen, shot, roles, room.bands, room.memory, reader.mapping.lines(), aovs, ids,
                          kept, held & {*present}, self.options.adapt)
 
     def _decide(self, source: Path, seen: Survey, weighting: str) -> Shot:
@@ -147,9 +147,12 @@ class Job:
         return seen
 
     def survey_of(self, source: Path) -> Survey:
-        """What another frame of the shot is like. Raises LbmcError."""
+        """What another frame of the shot is like. Raises LbmcError, also for a frame that says nothing of the shot."""
         with self.open(source) as reader:
-            return survey(reader.blocks(), reader.header.display_window)
+            if not reader.total:
+                raise InputError(f"{source}: there is no sample anywhere, so it cannot decide for others; name another "
+                                 f"frame")
+            return surveyed(source, reader.blocks(), reader)
 
     def frame(self, frame: sequences.Frame, progress: Progress) -> DenoisedFrame:
         """Denoises one frame. Raises FrameSkippedError, LbmcError."""
@@ -161,6 +164,7 @@ class Job:
         begun = time.perf_counter()
         with self.open(frame.source) as reader:
             plan = self.plan(frame.source, reader, progress.update)
+            self._tell_memory(plan, progress)
             if self.options.dry_run:
                 print(f"{frame.source} -> {', '.join(map(str, targets))}")
                 for line in plan.lines():
@@ -185,6 +189,13 @@ class Job:
                 self._told.add(what)
                 progress.note(f"{plan.source}: {line}; if it matters, pass --exposure-from with a frame that has it, "
                               f"or --no-adapt")
+
+    def _tell_memory(self, plan: FramePlan, progress: Progress) -> None:
+        """Once for a job, where a frame takes more than its budget however it is cut."""
+        if plan.memory > self.memory and "memory" not in self._told:
+            self._told.add("memory")
+            progress.note(f"{plan.source}: needs about {plan.memory / 2**30:.3g} GiB even in its smallest bands, more "
+                          f"than the {self.memory / 2**30:.3g} GiB of --memory; have that much free")
 
     def produce(self, frame: sequences.Frame, wanted: list[Path], plan: FramePlan, reader: FrameReader,
                 update: Callable[[float], None]) -> tuple[int, float]:
@@ -257,14 +268,23 @@ def run_job(kind: type[Job], options: DenoiseOptions) -> JobReport[DenoisedFrame
     job.sources = [frame.source for frame in frames]
     to_do = options.dry_run
     if not options.dry_run:
+        inputs = Inputs(job.sources)
         for frame in frames:  # a refused output is found before hours of work, not after
             for target in job.targets(frame):
-                to_do |= output_action(target, [other.source for other in frames], options.existing)
+                to_do |= output_action(target, inputs, options.existing)
     if to_do and (key := exposure_frame(options)) is not None:
         job.key = job.survey_of(key)  # all frames depend on it: what is wrong with it fails the job, once
     progress = make_progress(options.progress, len(frames))
     with progress:
         return run_frames(frames, job.frame, progress, str)
+
+
+def surveyed(source: Path, blocks: Iterable[PathSamples], reader: FrameReader) -> Survey:
+    """What a frame is like, of which `blocks` are all samples. Raises InputError where none of them has a radiance."""
+    seen = survey(blocks, reader.header.display_window)
+    if seen.samples == 0:
+        raise InputError(f"{source}: no sample has a finite radiance; render the frame again")
+    return seen
 
 
 def to_pixel_type(values: npt.NDArray[np.float32], pixel_type: str) -> tuple[npt.NDArray[Any], int]:

@@ -26,7 +26,7 @@ from deep_io.sequences import Frame
 from pipelines.denoise import VERSION_ATTRIBUTE, Job
 from pipelines.export_options import ExportOptions
 from pipelines.frame_reader import FrameReader
-from pipelines.inference import to_model
+from pipelines.inference import read_bands
 from pipelines.plan import FramePlan
 
 PARTITION_ATTRIBUTE = "lbmc:partition"  # not lbmc:model, which says that a file is denoised
@@ -50,18 +50,16 @@ class SamplesJob(Job):
               DeepWriter(temporary, self._header(raw.header, names, dtype, raw.path), options.compression,
                          options.threads) as writer):
             top = raw.header.data_window.ymin
-            for number, band in enumerate(plan.bands):
-                block = reader.read(top + band.read0, top + band.read1)
-                samples = to_model(block, plan.roles, plan.shot.scale.depth, self.device, held=plan.held)
-                shares = self.net.partition(samples, plan.shot.scale, layers).float().cpu().numpy()
+            for item in read_bands(reader, self.net, plan.shot.scale, plan.roles, plan.bands, update, plan.held):
+                band = item.band
+                shares = self.net.partition(item.samples, plan.shot.scale, layers, item.decoded).float().cpu().numpy()
                 shares = np.pad(shares, ((0, 0), (count - layers, 0)))
-                stored = stored_shares(block, shares, int(row_samples[band.read0 : band.read1].sum()))
+                stored = stored_shares(item.block, shares, int(row_samples[band.read0 : band.read1].sum()))
                 first = int(row_samples[band.read0 : band.y0].sum())
                 deep = raw.read(top + band.y0, top + band.y1)
                 own = stored[first : first + deep.total].astype(dtype)
                 added = {name: np.ascontiguousarray(own[:, layer]) for layer, name in enumerate(names)}
                 writer.write(DeepSamples(deep.counts, {**deep.channels, **added}, deep.window))
-                update((number + 1) / len(plan.bands))
         return 0, 0.0
 
     def _header(self, header: Header, names: list[str], dtype: np.dtype[Any], path: str) -> Header:

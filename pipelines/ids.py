@@ -19,7 +19,7 @@ from deep_io.deep_reader import DeepReader
 from deep_io.errors import InputError
 from deep_io.header import Header
 from deep_io.path_samples import SampleReader
-from pipelines.aovs import CRYPTOMATTE, cryptomatte_names, layers_of
+from pipelines.channel_names import CRYPTOMATTE, cryptomatte_names, id_channels, layers_of
 
 RANKS = 6  # ids kept in a pixel: Cryptomatte's usual depth
 Bits = npt.NDArray[np.uint32]
@@ -48,8 +48,8 @@ def find_ids(names: Sequence[str], header: Header, source: str) -> list[IdChanne
         choices = [name, f"{name}00.R", *(alone if len(alone) == 1 else ())]
         channel = next((choice for choice in choices if choice in types), None)
         if channel is None:
-            uints = [there for there, dtype in types.items() if dtype.kind == "u"]
-            raise InputError(f"{source}: no id channel {name!r}; channels of integers are {', '.join(uints) or 'none'}")
+            there = ", ".join(dict.fromkeys(id_channels(header).values()))
+            raise InputError(f"{source}: no id channel {name!r}; there are {there or 'none'}")
         if types[channel].itemsize != 4:
             raise InputError(f"{source}: {channel} is half, which cannot hold ids; they are uint or Cryptomatte floats")
         base = name.removesuffix(".R").removesuffix("00")

@@ -5,7 +5,8 @@ The only place where deep_io's arrays become the model's tensors. Which files, a
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,8 @@ from model.denoiser import Denoiser
 from model.features import FrameScale
 from model.samples import Samples
 from pipelines.cells import Cells, merged
-from pipelines.tiles import Band, narrowed
+from pipelines.frame_context import frame_context, strips
+from pipelines.tiles import Band, narrowed, within_reach
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -87,6 +89,59 @@ def to_model(block: PathSamples, roles: tuple[str, ...], depth: float, device: t
     )
 
 
+@dataclass(frozen=True)
+class BandInput:
+    """What the network gets of a band: its samples, halo included, and of a context that bands share its part.
+
+    block : the samples as they were read
+    """
+
+    band: Band
+    block: PathSamples
+    samples: Samples
+    decoded: torch.Tensor | None
+
+
+def read_bands(
+    reader: SampleReader,
+    net: Denoiser,
+    scale: FrameScale,
+    roles: tuple[str, ...],
+    bands: list[Band],
+    update: Callable[[float], None] = lambda _: None,
+    held: frozenset[str] = frozenset(),
+    cells: Cells | None = None,
+) -> Iterator[BandInput]:
+    """The input of band after band; their halos, and a context that several share, make cuts invisible.
+
+    cells : rows without pixels to filter are left out of the bands, and what they alone see is not even read
+    """
+    window = reader.header.data_window
+    device = next(net.parameters()).device
+
+    def read(first: int, last: int) -> tuple[PathSamples, Samples]:
+        block, squares = reader.read(window.ymin + first, window.ymin + last), None
+        if cells is not None:
+            block, squares = merged(block, cells.alike[first:last])
+        return block, to_model(block, roles, scale.depth, device, reader.carried_lights, held, squares)
+
+    busy = np.ones(window.height, np.bool_) if cells is None else np.logical_not(cells.mask.all(1))
+    halo, looks = net.reach, []
+    if len(bands) > 1 and net.tile_reach is not None:
+        halo, tallest = net.tile_reach, max(band.read1 - band.read0 for band in bands)
+        looks = strips(*within_reach(busy, net.reach, net.stride), window.height, tallest, net.stride)
+    bands = narrowed(bands, busy, window.height, halo, net.stride)
+    done = itertools.count(1)
+
+    def step() -> None:
+        update(next(done) / (len(looks) + len(bands)))
+
+    context = frame_context(net, scale, lambda *rows: read(*rows)[1], looks, step) if looks else None
+    for band in bands:
+        yield BandInput(band, *read(band.read0, band.read1), None if context is None else context.of(band))
+        step()
+
+
 @torch.inference_mode()
 def denoise_bands(
     reader: SampleReader,
@@ -99,13 +154,11 @@ def denoise_bands(
     held: frozenset[str] = frozenset(),
     cells: Cells | None = None,
 ) -> FrameLayers:
-    """Denoises a frame band by band; the bands' halos make the result independent of the cuts.
+    """Denoises a frame band by band.
 
-    cells : those that pass through are not filtered, and what is out of reach of all others is not even read. None:
-        everything is filtered
+    cells : those that pass through are not filtered. None: everything is filtered
     """
     window = reader.header.data_window
-    device = next(net.parameters()).device
     size = (window.height, window.width)
     frame = Layers(
         color=torch.empty(1, layers, 3, *size),
@@ -115,21 +168,15 @@ def denoise_bands(
         extra=torch.empty(1, layers, reader.carried, *size),
     )
     passing = np.zeros(size, np.bool_) if cells is None else cells.mask
-    busy: npt.NDArray[np.bool_] = np.logical_not(passing.all(1))
-    bands = narrowed(bands, busy, window.height, net.reach, net.stride)
-    for number, band in enumerate(bands):
-        block, squares = reader.read(window.ymin + band.read0, window.ymin + band.read1), None
-        if cells is not None:
-            block, squares = merged(block, cells.alike[band.read0 : band.read1])
-        samples = to_model(block, roles, scale.depth, device, reader.carried_lights, held, squares)
-        del block
-        wanted = torch.zeros(1, band.read1 - band.read0, window.width, dtype=torch.bool)
+    for item in read_bands(reader, net, scale, roles, bands, update, held, cells):
+        band = item.band
         rows = slice(band.y0 - band.read0, band.y1 - band.read0)
+        wanted = torch.zeros(1, band.read1 - band.read0, window.width, dtype=torch.bool)
         wanted[0, rows] = torch.from_numpy(~passing[band.y0 : band.y1])
-        result = net(samples, scale, layers, fill=False, wanted=wanted.to(device))
+        wanted = wanted.to(item.samples.weight.device)
+        result = net(item.samples, scale, layers, fill=False, wanted=wanted, decoded=item.decoded)
         for whole, part in zip(_planes(frame), _planes(result), strict=True):
             whole[..., band.y0 : band.y1, :] = part[..., rows, :].cpu()
-        update((number + 1) / len(bands))
     if cells is not None and cells.means is not None:
         _pass_through(frame, cells, cells.means, passing)
     return FrameLayers(*(plane[0].numpy() for plane in _planes(fill_holes(frame))))

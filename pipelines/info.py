@@ -5,6 +5,7 @@ Streams the file by blocks of rows; nothing is written.
 
 from __future__ import annotations
 
+import math
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -141,7 +142,7 @@ class FileInfo:
         if statistics.repairs:
             text.append("repaired    " + ", ".join(f"{count} x {what}" for what, count in statistics.repairs.items()))
         else:
-            text.append("repaired    nothing: every value is finite")
+            text.append("repaired    nothing: no value is broken")
         return [*text, "a denoising job on this frame", *(f"  {line}" for line in decision_lines(self.survey))]
 
 
@@ -202,7 +203,7 @@ def file_info(
         return FileInfo(
             path=os.fspath(path),
             headers=tuple(headers),
-            part=next(number for number, header in enumerate(headers) if header == reader.header),
+            part=reader.part,
             mapping=tuple(reader.mapping.lines()),
             sources={role: source.channels for role, source in reader.mapping.sources.items()},
             weighting=reader.weighting,
@@ -252,7 +253,7 @@ def _header_lines(headers: Sequence[Header], part: int | None) -> list[str]:
 
 
 def header_as_dict(header: Header) -> dict[str, Any]:
-    """A header in plain values; attributes of types that lbmc does not interpret are left as their type's name."""
+    """A header in plain values: None for what is not finite, their type's name for attributes not known to lbmc."""
     return {
         "name": header.name,
         "type": header.type,
@@ -275,8 +276,8 @@ def _corners(header: Header) -> tuple[tuple[int, int, int, int], tuple[int, int,
 def _plain(value: Any, kind: str) -> Any:
     if isinstance(value, bytes):
         return f"<{kind}, {len(value)} bytes>"
-    if isinstance(value, np.ndarray):
-        return value.tolist()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None  # which JSON has no word for
     if isinstance(value, (tuple, list)):
         return [_plain(item, kind) for item in value]
     return value if isinstance(value, (str, int, float, bool)) or value is None else str(value)

@@ -16,6 +16,7 @@ from pipelines.signals import raise_if_stopped
 
 EXIT_OK = 0
 EXIT_SOME_FAILED = 1
+NO_MEMORY = ("can't allocate memory", "out of memory")  # in the RuntimeErrors of torch, on a CPU and on a GPU
 
 Frame = TypeVar("Frame")
 Value = TypeVar("Value")
@@ -128,6 +129,9 @@ def describe_error(error: BaseException) -> str:
         return text
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    cure = "pass a smaller --memory, or run on a machine with more"
     if isinstance(error, MemoryError):
-        return f"out of memory{': ' + text if text else ''}; pass a smaller --memory, or run on a machine with more"
+        return f"out of memory{': ' + text if text else ''}; {cure}"
+    if isinstance(error, RuntimeError) and any(words in text.lower() for words in NO_MEMORY):
+        return f"out of memory; {cure}"
     return f"{type(error).__name__}: {text} (unexpected; --debug shows where)"

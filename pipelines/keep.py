@@ -13,6 +13,7 @@ from deep_io.deep_reader import DeepReader
 from deep_io.errors import InputError, UsageError
 from deep_io.header import Header
 from deep_io.samples import DeepSamples
+from pipelines.channel_names import id_channels
 
 WRITTEN = ("R", "G", "B", "A")  # the beauty's own channels
 
@@ -46,16 +47,11 @@ def find_kept(header: Header, weighting: str, wanted: Sequence[str], source: str
     if weighting != "uniform":
         raise UsageError(f"{source}: --keep averages samples of equal weight, these are weighted {weighting}")
     names = matching_channels(header, wanted, source)
-    ids = [name for name in id_channels(header) if name in names]
-    if ids:
-        raise InputError(f"{source}: channel {ids[0]} holds ids, which cannot be averaged; leave it out of --keep, and "
-                         f"pass --ids {ids[0]} to have them ranked")
+    for channel, owner in id_channels(header).items():
+        if channel in names:
+            raise InputError(f"{source}: channel {channel} holds ids, which cannot be averaged; leave it out of "
+                             f"--keep, and pass --ids {owner} to have them ranked")
     return names
-
-
-def id_channels(header: Header) -> list[str]:
-    """The channels of integers."""
-    return [channel.name for channel in header.channels if channel.dtype.kind == "u"]
 
 
 def kept_channels(

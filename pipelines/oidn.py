@@ -26,7 +26,8 @@ class Oidn:
         try:
             import pyoidn
         except ImportError as error:
-            raise UsageError(f"Intel Open Image Denoise is needed: pip install 'lbmc[bench]' ({error})") from error
+            raise UsageError(f"Intel Open Image Denoise is needed: install lbmc with its extra 'bench' ({error})"
+                             ) from error
         self._oidn = pyoidn
         self._device = pyoidn.Device()
         if threads is not None:

@@ -60,7 +60,7 @@ class DenoiseOptions:
     model: str | None = None
     """Name of a preset or path of a .safetensors file. None: the zoo's default preset."""
     layers: int | None = None
-    """1 to 5 layers. None: the survey decides."""
+    """1 to 5 layers. None: as many as the network has; with `adapt` 1 where the frame that decides hits nothing."""
     adapt: bool = True
     """False: no savings; every role is modelled, every cell filtered, with as many layers as the weights hold."""
     exposure: float | None = None

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_io.aliases import DISTANCE, VIEW, WORLD
-from deep_io.atomic import Existing, atomic_output, output_action
+from deep_io.atomic import Existing, Inputs, atomic_output, output_action
 from deep_io.camera import Camera, parse_camera
 from deep_io.conventions import DEPTH_ATTRIBUTE, NORMALS_ATTRIBUTE, Conventions, resolve
 from deep_io.decoding import LARGEST_RADIANCE, Interpretation, path_samples, radiance_values
@@ -39,6 +39,11 @@ SEED_TOKEN = "@SEED@"
 # Beyond this many samples L / n in half loses its digits to underflow, so radiance is written as float.
 MOST_IN_HALF = 16
 _BLOCK_SAMPLES = 1 << 20
+OVERFLOW = "radiance overflow"  # among the repairs: radiance beyond half, stored as Inf
+_REPAIRED = {
+    "radiance": f"left out: their radiance is not finite, or beyond {LARGEST_RADIANCE:g}",
+    OVERFLOW: f"of radiance stored as Inf, which in half is an overflow: read as {HALF_MAX:g}",
+}
 
 
 @dataclass(frozen=True)
@@ -89,9 +94,8 @@ class PackReport:
 
     def lines(self) -> list[str]:
         """The report as text."""
-        mended = [f"{self.target}: {count} samples " + (
-                      f"left out: their radiance is not finite, or beyond {LARGEST_RADIANCE:g}" if role == "radiance"
-                      else f"without finite {role}") for role, count in sorted(self.repairs.items()) if count]
+        mended = [f"{self.target}: {count} samples {_REPAIRED.get(role, f'without finite {role}')}"
+                  for role, count in sorted(self.repairs.items()) if count]
         return [f"{self.target}: {self.samples} samples per pixel", *self.mapping.lines(), *self.notes, *mended]
 
 
@@ -110,7 +114,7 @@ def plan(sources: Sequence[PathLike], target: PathLike, seeds: str | None = None
     if seeds is not None:
         if len(patterns) != 1:
             raise UsageError(f"--seeds {seeds}: takes one name with {SEED_TOKEN}, not {len(patterns)} names")
-        patterns = substitute(patterns[0], SEED_TOKEN, parse_frames(seeds))
+        patterns = substitute(patterns[0], SEED_TOKEN, parse_frames(seeds, f"--seeds {seeds}"))
     if not patterns:
         raise UsageError("pack needs at least one render")
     for pattern in patterns:
@@ -140,7 +144,7 @@ def pack_frames(jobs: Sequence[PackJob], options: PackOptions | None = None, pro
                 ) -> JobReport[PackReport]:
     """Pack every job; one that fails does not stop the others. Refused outputs raise before any work is done."""
     options = options or PackOptions()
-    every_source = [source for job in jobs for source in job.sources]
+    every_source = Inputs(source for job in jobs for source in job.sources)
     for job in jobs:
         output_action(job.target, every_source, options.existing)
 
@@ -245,7 +249,8 @@ class _Encoding:
         counts = block.counts.ravel()
         alpha = self._alpha(block, repairs)
         samples = path_samples(block, self.how)
-        repairs.update(samples.repairs)
+        # Those without a radiance are gone already: what is mended of it are the overflows.
+        repairs.update({OVERFLOW if role == "radiance" else role: count for role, count in samples.repairs.items()})
         hit = samples.coverage > 0
         alpha = np.where(hit, 1, 0).astype(np.float32) if alpha is None else alpha
         if "depth" in samples.roles:

@@ -197,7 +197,7 @@ def _figure(width: float, height: float, layout: Literal["constrained"] | None =
     try:
         from matplotlib.figure import Figure
     except ImportError as missing:
-        raise UsageError(f"drawing needs matplotlib: pip install 'lbmc[bench]' ({missing})") from missing
+        raise UsageError(f"drawing needs matplotlib: install lbmc with its extra 'bench' ({missing})") from missing
     return Figure(figsize=(width, height), dpi=DOTS_PER_INCH, layout=layout)
 
 

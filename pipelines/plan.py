@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from model.denoiser import Denoiser
 from model.features import FrameScale
 from pipelines.aovs import Aovs
 from pipelines.decisions import Decisions
 from pipelines.frame_reader import FrameReader
 from pipelines.ids import IdChannel
 from pipelines.survey import Survey
-from pipelines.tiles import Band, memory_needed, plan_bands
+from pipelines.tiles import Band, FrameLoad, plan_bands
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class FramePlan:
             f"exposure: {self.shot.scale.exposure:.6g}, depth scale: {self.shot.scale.depth:.6g}",
             f"layers: {self.shot.layers}",
             *([] if seen.mixed is None else [f"depth mixes in {seen.mixed:.1%} of the pixels"]),
-            *(seen.cells.lines() if self.adapt else []),
+            *(seen.cells.lines() if self.adapt else ["not adapted: no role is held, every cell is filtered"]),
             *(f"AOV: {', '.join(group.outputs)} filtered as {group.kind}" for group in self.aovs.groups),
             *([f"kept as pixel means: {' '.join(self.kept)}"] if self.kept else []),
             *(f"ids: {one.channel} ranked as {one.base}" for one in self.ids),
@@ -80,18 +81,20 @@ class Room:
     """Whether the decoded frame stays in memory between survey and network: only where that costs no band."""
 
 
-def fit(reader: FrameReader, reach: int, stride: int, memory: int) -> Room:
+def fit(reader: FrameReader, net: Denoiser, layers: int, memory: int) -> Room:
     """Plans the bands of a frame from its header and the sizes of its rows; no sample is read."""
-    window = reader.header.data_window
-    per_pixel = reader.total / (window.width * window.height)
+    load = FrameLoad(reader.header.data_window.width, reader.samples_per_row, layers, reader.carried)
 
-    def planned(budget: int) -> list[Band]:
-        return plan_bands(window.height, window.width, per_pixel, reach, stride, budget, reader.carried)
+    def planned(budget: int) -> tuple[list[Band], int]:
+        bands = plan_bands(load, net.reach, net.tile_reach, net.stride, budget)
+        shared = len(bands) > 1 and net.tile_reach is not None
+        tallest = max(band.read1 - band.read0 for band in bands)
+        return bands, load.needed_shared(tallest) if shared else load.needed(tallest)
 
-    bands, beside = planned(memory), 0
-    keep = len(bands) == 1  # the network's estimate holds a decoded frame already
-    if not keep and memory > reader.kept_bytes and len(planned(memory - reader.kept_bytes)) == len(bands):
-        bands, beside, keep = planned(memory - reader.kept_bytes), reader.kept_bytes, True
-    tallest = max(band.read1 - band.read0 for band in bands)
-    needed = memory_needed(tallest, window.width, per_pixel, reader.carried)
-    return Room(bands, needed + beside, keep)
+    bands, needed = planned(memory)
+    if len(bands) == 1:  # its estimate holds a decoded frame already
+        return Room(bands, needed, keep=True)
+    tighter, beside = planned(memory - reader.kept_bytes)
+    if len(tighter) == len(bands) and beside + reader.kept_bytes <= memory:
+        return Room(tighter, beside + reader.kept_bytes, keep=True)
+    return Room(bands, needed, keep=False)

@@ -6,16 +6,25 @@ changes nothing in the result.
 
 from __future__ import annotations
 
+import os
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-BYTES_PER_SAMPLE = 160  # decoded roles in float32, and what the network holds per sample
-BYTES_PER_PIXEL = 3600  # planes, predictions and context of two layers at their peak
-CARRIED_PER_SAMPLE, CARRIED_PER_PIXEL = 16, 128  # more of both for each channel filtered besides the radiance
-BYTES_BASE = 500 << 20  # the process with its libraries
-DEFAULT_MEMORY = 4 << 30
+# From peaks of `lbmc denoise` on frames of 960x540 and 1920x540 with 2 to 24 samples and 1 to 5 layers; a tenth more.
+BYTES_BASE = 350 << 20  # the process with its libraries
+BYTES_PER_SAMPLE = 105  # decoded roles in float32, and what the network holds per sample
+BYTES_PER_PIXEL = 450  # context
+BYTES_PER_LAYER = 1100  # of each pixel: planes and predictions
+BYTES_PER_CARRIED = (16, 64)  # for each channel filtered besides the radiance: of each sample, of each pixel and layer
+BYTES_OF_RESULT = 24  # of each pixel and layer of a frame, whatever its bands
+BYTES_OF_CONTEXT = 80  # of each pixel of a frame whose bands share a context
+BYTES_TO_DECODE = 600  # the same while it is made, before the first band
+DEFAULT_MEMORY = 8 << 30
+CONTROL_GROUP = Path("/sys/fs/cgroup/memory.max")
 
 
 @dataclass(frozen=True)
@@ -28,21 +37,72 @@ class Band:
     read1: int
 
 
-def memory_needed(rows: int, width: int, samples_per_pixel: float, carried: int = 0) -> int:
-    """Estimated peak bytes of denoising so many full rows, with so many further channels, at once."""
-    pixel = BYTES_PER_PIXEL + carried * CARRIED_PER_PIXEL
-    return BYTES_BASE + round(rows * width * (pixel + (BYTES_PER_SAMPLE + carried * CARRIED_PER_SAMPLE)
-                                              * samples_per_pixel))
+@dataclass(frozen=True)
+class FrameLoad:
+    """What a frame weighs on memory.
+
+    samples : (height,) how many each row holds
+    carried : channels filtered besides the radiance
+    """
+
+    width: int
+    samples: npt.NDArray[np.int64]
+    layers: int
+    carried: int = 0
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return len(self.samples)
+
+    def most_samples(self, rows: int) -> int:
+        """In any so many neighbouring rows."""
+        before = np.concatenate([[0], np.cumsum(self.samples)])
+        rows = min(rows, self.height)
+        return int((before[rows:] - before[: len(before) - rows]).max())
+
+    def needed(self, rows: int) -> int:
+        """Estimated peak bytes of denoising any so many rows at once."""
+        per_sample, per_layer = BYTES_PER_CARRIED
+        pixel = BYTES_PER_PIXEL + self.layers * (BYTES_PER_LAYER + self.carried * per_layer)
+        samples = self.most_samples(rows) * (BYTES_PER_SAMPLE + self.carried * per_sample)
+        result = self.height * self.width * self.layers * BYTES_OF_RESULT
+        return BYTES_BASE + result + rows * self.width * pixel + samples
+
+    @property
+    def context(self) -> int:
+        """Estimated bytes of a context that bands share."""
+        return self.height * self.width * BYTES_OF_CONTEXT
+
+    def needed_shared(self, rows: int) -> int:
+        """`needed` where bands share a context."""
+        return max(self.needed(rows) + self.context, BYTES_BASE + self.height * self.width * BYTES_TO_DECODE)
 
 
-def plan_bands(height: int, width: int, samples_per_pixel: float, reach: int, stride: int, memory: int,
-               carried: int = 0) -> list[Band]:
-    """The fewest equal bands that fit the budget; where none fits, bands of one stride, the smallest there are."""
-    if memory_needed(height, width, samples_per_pixel, carried) <= memory:
+def default_memory() -> int:
+    """Bytes: DEFAULT_MEMORY, or half of what the machine, or this process's control group, has, where that is less."""
+    there = [2 * DEFAULT_MEMORY]
+    with suppress(AttributeError, ValueError, OSError):  # no sysconf, or it does not know
+        there.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    with suppress(OSError, ValueError):  # no such group, or "max"
+        there.append(int(CONTROL_GROUP.read_text()))
+    return min(there) // 2
+
+
+def plan_bands(load: FrameLoad, reach: int, shared_reach: int | None, stride: int, memory: int) -> list[Band]:
+    """The fewest equal bands that fit the budget; where none fits, bands of one stride, the smallest there are.
+
+    reach, shared_reach : of the network, and of one whose bands share a context, None if they cannot
+    """
+    height = load.height
+    if load.needed(height) <= memory:
         return [Band(0, height, 0, height)]
-    per_row = memory_needed(1, width, samples_per_pixel, carried) - BYTES_BASE
+    if shared_reach is not None:
+        reach, memory = shared_reach, memory - load.context
     halo = 2 * reach + stride  # above, below, and down to the grid
-    fitting = max((memory - BYTES_BASE) // per_row - halo, stride) // stride * stride
+    fitting = stride
+    while fitting < height and load.needed(min(fitting + stride + halo, height)) <= memory:
+        fitting += stride
     rows = -(-height // -(-height // fitting))  # as many bands, but equal ones
     rows = -(-rows // stride) * stride
     return [_band(y, min(y + rows, height), height, reach, stride) for y in range(0, height, rows)]
@@ -60,6 +120,14 @@ def narrowed(bands: list[Band], busy: npt.NDArray[np.bool_], height: int, reach:
             first = band.y0 + int(rows[0]) // stride * stride
             some.append(_band(first, band.y0 + int(rows[-1]) + 1, height, reach, stride))
     return some
+
+
+def within_reach(busy: npt.NDArray[np.bool_], reach: int, stride: int) -> tuple[int, int]:
+    """First row, on the grid, and last, exclusive, of what the busy rows of a frame can see; (0, 0) if none is busy."""
+    rows = np.flatnonzero(busy)
+    if not rows.size:
+        return 0, 0
+    return max(int(rows[0]) - reach, 0) // stride * stride, min(int(rows[-1]) + 1 + reach, len(busy))
 
 
 def _band(y0: int, y1: int, height: int, reach: int, stride: int) -> Band:

@@ -11,6 +11,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
+
+from pipelines.rendering.backend import RendererMissingError, find_llvm
+
 LBMC = Path(sys.executable).parent / "lbmc"
 
 
@@ -57,3 +61,12 @@ def in_process(*arguments: object, env: Mapping[str, str] | None = None, cwd: Pa
         os.environ.clear()
         os.environ.update(before)
     return Finished(code, out.getvalue(), err.getvalue())
+
+
+def require_renderer() -> None:
+    """Skips the module of tests that calls it where nothing can be rendered, and says why."""
+    pytest.importorskip("mitsuba")
+    try:
+        find_llvm()
+    except RendererMissingError as missing:
+        pytest.skip(str(missing), allow_module_level=True)

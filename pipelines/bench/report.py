@@ -64,7 +64,8 @@ def png(tones: Image) -> bytes:
     try:
         from PIL import Image as Pillow
     except ImportError as missing:
-        raise UsageError(f"the report's images need Pillow: pip install 'lbmc[bench]' ({missing})") from missing
+        raise UsageError(f"the report's images need Pillow: install lbmc with its extra 'bench' ({missing})"
+                         ) from missing
     buffer = io.BytesIO()
     Pillow.fromarray(np.round(255.0 * tones).astype(np.uint8)).save(buffer, format="PNG", optimize=True)
     return buffer.getvalue()

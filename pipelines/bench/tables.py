@@ -15,7 +15,7 @@ SMALL_FRAME = 0.2
 FULL_HD = 1920 * 1080 / 1e6
 """Megapixels of the frame that times per megapixel are scaled to for a reader."""
 
-INSTALL_OIDN = "OIDN is left out: pyoidn is not installed; pip install 'lbmc[bench]' brings it."
+INSTALL_OIDN = "OIDN is left out: pyoidn is not installed; install lbmc with its extra 'bench'."
 PUBLISHED = {
     "PIXELGATHER": (0.0352, 0.0353),
     "SAMPLESPLAT": (0.0298, 0.0344),

@@ -17,7 +17,7 @@ SEARCH = ("/usr/lib/*/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*", "/usr/l
           "/usr/lib64/llvm*/lib/libLLVM*.so*", "/usr/local/lib/libLLVM*.so*",
           "/opt/homebrew/opt/llvm*/lib/libLLVM*.dylib", "/usr/local/opt/llvm*/lib/libLLVM*.dylib")
 CURE = "install LLVM 17 or newer (Debian: `apt install libllvm19`) or point DRJIT_LIBLLVM_PATH at its libLLVM.so"
-MITSUBA_CURE = "pip install 'lbmc[render]'"
+MITSUBA_CURE = "install lbmc with its extra 'render'"
 
 
 class RendererMissingError(UsageError):

@@ -55,7 +55,8 @@ def load_pillow() -> Any:
         from PIL import Image
     except ImportError as missing:
         raise UsageError(
-            f"a contact sheet needs Pillow ({missing}): pip install 'lbmc[render]', or pass --no-contact-sheet"
+            f"a contact sheet needs Pillow ({missing}): install lbmc with its extra 'render', or pass "
+            f"--no-contact-sheet"
         ) from missing
     return Image
 

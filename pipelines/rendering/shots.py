@@ -29,8 +29,8 @@ CLAMP = (60.0, 240.0)
 EMISSION_CLAMP = 1e4
 BRIGHTNESS_STOPS = 1.5  # standard deviation
 # relMSE of eight samples, estimated from a pilot. Scenes harder than HARDEST are noise alone, and at EASIEST there is
-# nothing left to learn but to leave the picture as it is. What lies between is kept nearly as it comes: networks that
-# saw few scenes under EASY were up to twice as far from the best on input of little noise, where detail counts most.
+# nothing left to learn but to leave the picture as it is. What lies between is kept nearly as it comes: a network that
+# sees few scenes under EASY blurs detail where there is little noise.
 EASIEST, EASY, HARDEST = 0.006, 0.12, 1.2
 EASY_KEPT = 0.85
 # The 95th percentile of |coc| in pixels: more than was asked for means that the lens reaches into a wall beside it.

@@ -19,6 +19,7 @@ from deep_io.csr import offsets_of, pixels_of
 from deep_io.errors import InputError
 from deep_io.flat import read_flat
 from deep_io.path_samples import PathSamples, SampleReader
+from deep_io.samples import Window
 from model.metrics import common_scale
 from pipelines.survey import survey
 from pipelines.training.cache import (
@@ -83,12 +84,14 @@ def build_cache(source: Path, folder: Path, report: Report = lambda _: None, thr
     files = scene_files(source)
     folder.mkdir(parents=True, exist_ok=True)
     known = read_index(folder)
+    done: dict[str, SceneEntry] = {}
     missing = [item for item in files if item.name not in known or known[item.name].stamp != item.stamp()]
     for number, item in enumerate(missing, 1):
-        known[item.name] = cache_scene(item, folder, threads)
+        done[item.name] = cache_scene(item, folder, threads)
         report(f"cached {item.name} ({number} of {len(missing)})")
-        _write_index(folder, [known[f.name] for f in files if f.name in known])
-    _write_index(folder, [known[item.name] for item in files])
+        there = {**read_index(folder), **done}  # another run may be filling the same cache
+        _write_index(folder, [there[f.name] for f in files if f.name in there])
+    _write_index(folder, [{**known, **done}[item.name] for item in files])
     return SampleCache(folder)
 
 
@@ -102,7 +105,7 @@ def cache_scene(files: SceneFiles, folder: Path, threads: int | None = None) -> 
     """Writes one scene's arrays, block by block of its rows.
 
     Raises InputError, naming the file: a deep file that cannot be read or is too small, a reference that cannot be
-    read, is of another size, not finite or black.
+    read, has another data window, is not finite or black.
     """
     with SampleReader(files.deep, threads=threads) as reader, ExitStack() as outputs:
         window = reader.header.data_window
@@ -110,7 +113,7 @@ def cache_scene(files: SceneFiles, folder: Path, threads: int | None = None) -> 
         if min(height, width) < SMALLEST_CROP:
             raise InputError(f"{files.deep}: {width}x{height} pixels; training needs {SMALLEST_CROP}x{SMALLEST_CROP} "
                              f"or more")
-        target = read_reference(files.reference, (height, width), files.deep.name)
+        target = read_reference(files.reference, window, files.deep.name)
         counts: list[npt.NDArray[np.int32]] = []
         seen = survey(_noting(reader.blocks(), counts))
         offsets = offsets_of(np.concatenate([block.ravel() for block in counts]))
@@ -179,15 +182,19 @@ def _halves(block: PathSamples, exposure: float, depth: float) -> npt.NDArray[np
     return half
 
 
-def read_reference(path: Path, shape: tuple[int, int], deep: str) -> FloatArray:
-    """(H, W, 3) float32 linear radiance of the reference of the file named `deep`. Raises InputError naming `path`."""
-    channels = read_flat(path).channels
+def read_reference(path: Path, window: Window, deep: str) -> FloatArray:
+    """(H, W, 3) float32 linear radiance of the reference of the file named `deep`, whose data window is `window`.
+
+    Raises InputError naming `path`.
+    """
+    image = read_flat(path)
+    channels = image.channels
     missing = [name for name in "RGB" if name not in channels]
     if missing:
         raise InputError(f"{path}: no channel {missing[0]}; a reference needs R, G and B")
     target = np.stack([channels[name] for name in "RGB"], -1).astype(np.float32)
-    if target.shape[:2] != shape:
-        raise InputError(f"{path}: {target.shape[1]}x{target.shape[0]} pixels, but {deep} has {shape[1]}x{shape[0]}")
+    if image.window != window:
+        raise InputError(f"{path}: {_place(image.window)}, but {deep} has {_place(window)}; render both alike")
     if not np.isfinite(target).all():
         raise InputError(f"{path}: NaN or Inf in the reference; render it again")
     try:
@@ -195,3 +202,7 @@ def read_reference(path: Path, shape: tuple[int, int], deep: str) -> FloatArray:
     except ValueError as error:
         raise InputError(f"{path}: {error}; move the scene away") from None
     return target
+
+
+def _place(window: Window) -> str:
+    return f"{window.width}x{window.height} pixels at ({window.xmin}, {window.ymin})"

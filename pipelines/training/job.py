@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from deep_io.errors import InputError, UsageError
 from model import zoo
-from model.config import CONFIGS, Config
+from model.config import CONFIGS, FAST, Config
 from pipelines.training.batches import crop_size
 from pipelines.training.cache import CACHE_VERSION, SampleCache
 from pipelines.training.caching import build_cache, scene_files
@@ -32,8 +32,8 @@ class TrainOptions:
 
     data, validation : folders of NAME.deep.exr with NAME.ref.exr
     out : folder of the run, see run_folder.py; a checkpoint in it is resumed
-    network : a name of model.config.CONFIGS
-    start : weight file to start from instead of random weights
+    network : a name of model.config.CONFIGS; None: that of `start`, or fast
+    start : weight file, or a preset's name, to start from instead of random weights
     cache : folder for the decoded data; None: beside each data folder, see cache_beside
     device : auto, cpu or cuda
     threads : of each process; None leaves PyTorch's choice
@@ -45,7 +45,7 @@ class TrainOptions:
     data: Path
     validation: Path
     out: Path
-    network: str = "fast"
+    network: str | None = None
     recipe: Recipe = field(default_factory=Recipe)
     start: Path | None = None
     cache: Path | None = None
@@ -62,9 +62,7 @@ def train(options: TrainOptions, report: Callable[[str], None] = print) -> Path:
     Raises InputError and UsageError, naming the file, for data, weights and checkpoints that cannot be used, before
     training starts; StoppedError after SIGINT and SIGTERM, with a checkpoint written.
     """
-    if options.network not in CONFIGS:
-        raise UsageError(f"--network {options.network}: there are {', '.join(CONFIGS)}")
-    config = CONFIGS[options.network]
+    config = network_of(options)
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     with joined(options.device) as group:
@@ -88,13 +86,13 @@ def _train(options: TrainOptions, config: Config, group: Group, report: Callable
         f"{group.device.type}, from step {trainer.step}")
     trainer.run(training, held_out, say, options.seconds, options.save_every, options.loaders)
     info = {
-        "description": f"{options.network}, trained by lbmc train",
+        "description": f"{config.name}, trained by lbmc train",
         "data": {"scenes": len(training.entries), "validation": len(held_out.entries)},
         "recipe": recipe.to_dict(),
         "steps": trainer.step,
         "scores": trainer.state.rows[-1] if trainer.state.rows else {},
     }
-    path = options.out / f"{options.network}{zoo.SUFFIX}"
+    path = options.out / f"{config.name}{zoo.SUFFIX}"
     group.first(lambda: trainer.folder.write_weights(path, trainer.averaged, info))
     say(f"wrote {path}")
     return path
@@ -114,7 +112,7 @@ def _prepare(options: TrainOptions, config: Config, group: Group, report: Callab
         starting_weights(options.start, config)
     RunFolder(options.out, config, options.recipe).read(torch.device("cpu"))
     if not can_draw():
-        report("curve.png and panels are not drawn: pip install 'lbmc[train]'")
+        report("curve.png and panels are not drawn: install lbmc with its extra 'train'")
     for source, folder in zip((options.data, options.validation), cache_folders(options), strict=True):
         build_cache(source, folder, report, options.threads)
 
@@ -137,12 +135,29 @@ def open_cache(source: Path, report: Callable[[str], None]) -> SampleCache:
     return build_cache(source, cache_beside(source), report)
 
 
+def network_of(options: TrainOptions) -> Config:
+    """The network to train. Raises UsageError where there is none of that name, or no weights to take it from."""
+    if options.network is None:
+        return FAST if options.start is None else _found(options.start).config
+    if options.network not in CONFIGS:
+        raise UsageError(f"--network {options.network}: there are {', '.join(CONFIGS)}")
+    return CONFIGS[options.network]
+
+
 def starting_weights(path: Path, config: Config) -> dict[str, Tensor]:
     """The weights of a file. Raises UsageError where it is none, or of another network than `config`."""
+    weights = _found(path)
+    if replace(weights.config, name=config.name) != config:
+        raise UsageError(f"--start: {path}: its network, {weights.config.name!r}, is not the {config.name!r} of "
+                         f"--network; without --network the file's is trained")
     try:
-        weights = zoo.find(str(path))
-        if {**weights.config.to_dict(), "name": ""} != {**config.to_dict(), "name": ""}:
-            raise ValueError(f"{path}: its network, {weights.config.name!r}, is not the {config.name!r} of --network")
         return weights.load().state_dict()
+    except ValueError as error:
+        raise UsageError(f"--start: {error}") from None
+
+
+def _found(path: Path) -> zoo.Weights:
+    try:
+        return zoo.find(str(path))
     except (ValueError, KeyError, TypeError) as error:
         raise UsageError(f"--start: {error}") from None

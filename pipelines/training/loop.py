@@ -111,6 +111,7 @@ class Trainer:
             self.optimizer.load_state_dict(found.optimizer)
         self.objective = group.wrap(Objective(self.net, recipe))
         self._torn = False  # weights and step count belong to different steps
+        self._wasted = 0  # steps in a row that changed nothing
 
     @property
     def step(self) -> int:
@@ -173,9 +174,8 @@ class Trainer:
             pool.shutdown(cancel_futures=True)
 
     def _refuse_to_go_on_for_nothing(self) -> None:
-        """Raises LbmcError where no step has had a finite gradient for long. All processes see the same losses."""
-        last = self.state.losses[-HOPELESS:]
-        if len(last) == HOPELESS and not np.isfinite(last).any():
+        """Raises LbmcError where no step has had a finite gradient for long. All processes see the same gradients."""
+        if self._wasted >= HOPELESS:
             raise LbmcError(f"step {self.step}: the last {HOPELESS} gradients were not finite, the weights have "
                             f"diverged; train anew with a lower --learning-rate")
 
@@ -219,8 +219,10 @@ class Trainer:
         self._torn = True
         if bool(torch.isfinite(norm)):
             self.optimizer.step()
+            self._wasted = 0
         else:
             mean = math.nan
+            self._wasted += 1
         keep = min(recipe.average, (1 + step) / (10 + step))
         with torch.no_grad():
             for mine, theirs in zip(self.averaged.parameters(), self.net.parameters(), strict=True):

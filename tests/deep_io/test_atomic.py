@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import signal
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from deep_io.atomic import atomic_output, output_action
+from deep_io.atomic import Inputs, atomic_output, output_action
 from deep_io.errors import InputError, OutputError, UsageError
 from deep_io.flat import write_flat
 
@@ -129,9 +133,60 @@ def test_an_output_is_never_an_input_whatever_the_options(tmp_path, link):
     if link is not None:
         target = tmp_path / "alias.exr"
         link(source, target)
+    inputs = [tmp_path / "other.exr", source, tmp_path / "third.exr"]
     for existing in ("refuse", "overwrite", "skip"):
-        with pytest.raises(UsageError, match="is the input"):
-            output_action(target, [tmp_path / "other.exr", source], existing)
+        for known in (inputs, Inputs(inputs)):
+            with pytest.raises(UsageError, match=rf"is the input {re.escape(str(source))} itself"):
+                output_action(target, known, existing)
+
+
+@pytest.mark.parametrize("link", [None, os.link, os.symlink])
+def test_inputs_that_were_looked_up_once_serve_every_output_of_a_job(tmp_path, link):
+    sources = [tmp_path / f"in.{number}.exr" for number in range(20)]
+    for source in sources:
+        source.write_bytes(source.name.encode())
+    inputs = Inputs(iter(sources))
+    for number, source in enumerate(sources):
+        name = source
+        if link is not None:
+            name = tmp_path / f"alias.{number}.exr"
+            link(source, name)
+        assert inputs.same_as(name) == str(source)
+        assert inputs.same_as(tmp_path / f"out.{number}.exr") is None
+        assert output_action(tmp_path / f"out.{number}.exr", inputs)
+
+
+def test_a_link_to_a_file_that_is_not_there_is_that_input_all_the_same(tmp_path):
+    os.symlink(tmp_path / "later.exr", tmp_path / "alias.exr")
+    with pytest.raises(UsageError, match="is the input"):
+        output_action(tmp_path / "alias.exr", [tmp_path / "later.exr"])
+
+
+@contextmanager
+def protected_folder() -> Iterator[Path]:
+    """A folder that this process may read and not write, also where the tests are run by root, who writes anywhere."""
+    nobody = 65534
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "there.exr").write_bytes(b"old")
+        folder.chmod(0o555)
+        root = os.geteuid() == 0
+        if root:
+            os.setresuid(nobody, nobody, 0)
+        try:
+            yield folder
+        finally:
+            if root:
+                os.setresuid(0, 0, 0)
+            folder.chmod(0o755)
+
+
+def test_an_output_to_be_left_as_it_is_may_lie_in_a_folder_that_cannot_be_written():
+    with protected_folder() as folder:
+        assert not output_action(folder / "there.exr", existing="skip")
+        for name, existing in (("there.exr", "overwrite"), ("there.exr", "refuse"), ("new.exr", "skip")):
+            with pytest.raises(InputError, match="cannot be written to"):
+                output_action(folder / name, existing=existing)
 
 
 def test_a_missing_folder_is_an_unsuitable_input_and_a_folder_is_no_file(tmp_path):

@@ -229,6 +229,14 @@ def test_windows_beyond_the_format_are_refused_as_openexr_refuses_them(tmp_path,
         read_headers(tmp_path / "a.exr")
 
 
+@pytest.mark.parametrize("aspect", [0.0, -1.0, float("inf"), float("nan")])
+def test_a_pixel_aspect_that_makes_no_sense_is_refused(tmp_path, aspect):
+    header = header_of(pixel_aspect=aspect)
+    (tmp_path / "a.exr").write_bytes(struct.pack("<iI", 20000630, 2) + encode_header(header))
+    with pytest.raises(InputError, match=r"a\.exr: the header's pixelAspectRatio is .* must be positive and finite"):
+        read_headers(tmp_path / "a.exr")
+
+
 def test_a_version_from_the_future_is_refused(tmp_path):
     (tmp_path / "a.exr").write_bytes(struct.pack("<iI", 20000630, 3) + encode_header(header_of()))
     with pytest.raises(InputError, match="version"):

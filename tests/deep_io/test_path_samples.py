@@ -174,6 +174,30 @@ def test_over_adds_virtual_misses_without_features_also_where_a_block_has_no_sam
 def test_a_file_without_any_sample_is_an_error(file):
     with pytest.raises(InputError, match="no sample anywhere"):
         SampleReader(write(file, {name: [] for name in "RGB"}, counts=[0, 0]))
+    for weighting in ("uniform", "packed"):
+        with pytest.raises(InputError, match="no sample anywhere"):
+            SampleReader(write(file, {name: [] for name in "RGBA"}, counts=[0, 0]), weighting=weighting)
+
+
+def test_a_file_without_any_sample_is_an_empty_picture_under_over(file):
+    path = write(file, {name: [] for name in ("R", "G", "B", "A", "Z", "roughness")}, counts=[[0, 0], [0, 0]],
+                 attributes={"lbmc:weighting": "over"})
+    samples = read(path)
+    assert samples.counts.tolist() == [[1, 1], [1, 1]]
+    assert samples.weight.tolist() == [1] * 4
+    assert samples.coverage.tolist() == [0] * 4
+    assert all((values == 0).all() and len(values) == 4 for values in samples.roles.values())
+    with SampleReader(path) as reader:
+        assert sum(block.total for block in reader.blocks(max_bytes=1)) == 4
+
+
+def test_a_depth_below_any_normal_number_is_unknown_and_not_broken(file):
+    """Equal depths are stored apart by the least step of a float, unknown ones, which are 0, too."""
+    tiny = float(np.finfo(np.float32).tiny)
+    samples = read(write(file, {**rgb(1, 1, 1, 1, 1), "Z": [0, 1e-45, 3e-45, tiny, -1e-45]}))
+    assert samples.roles["depth"][:, 0].tolist() == [0, 0, 0, tiny, 0]
+    assert samples.repairs == {"depth": 1}  # the negative one
+    assert samples.coverage.tolist() == [1] * 5
 
 
 def test_blocks_hold_the_same_samples_as_the_whole(file):
@@ -298,6 +322,23 @@ def test_a_singular_camera_is_an_error(file):
     path = write(file, {**rgb(1), "Normal.X": [0], "Normal.Y": [0], "Normal.Z": [1]},
                  attributes={"worldToCamera": (0.0,) * 16})
     with pytest.raises(InputError, match="singular"):
+        SampleReader(path)
+
+
+@pytest.mark.parametrize("text", [
+    '{"fieldOfView": true}', '{"fieldOfView": NaN}', '{"worldToCamera": [' + ", ".join(["Infinity"] * 16) + "]}",
+    " ".join(["nan"] * 16),
+])
+def test_a_camera_file_of_numbers_that_make_no_sense_is_an_error(file, tmp_path, text):
+    (tmp_path / "camera.txt").write_text(text)
+    with pytest.raises(UsageError, match=r"--camera .*camera\.txt: (the field of view|worldToCamera) must"):
+        SampleReader(write(file, rgb(1)), camera=str(tmp_path / "camera.txt"))
+
+
+def test_a_header_camera_that_is_not_finite_is_an_error(file):
+    path = write(file, {**rgb(1), "Normal.X": [0], "Normal.Y": [0], "Normal.Z": [1]},
+                 attributes={"worldToCamera": (float("inf"),) * 16})
+    with pytest.raises(InputError, match="worldToCamera matrix is not finite"):
         SampleReader(path)
 
 

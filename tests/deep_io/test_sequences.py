@@ -76,6 +76,23 @@ def test_ranges_that_cannot_be_read_are_usage_errors(shot, text):
         expand(shot / "shot.####.exr", text)
 
 
+@pytest.mark.parametrize("name", ["2024-11-23-####.exr", "shot_1-2-####.exr", "1001,####.exr", "shot.10x####.exr"])
+def test_what_ends_in_no_digit_is_a_name_and_no_range(name, tmp_path):
+    (tmp_path / name.replace("####", "0001")).touch()
+    assert [frame.number for frame in expand(tmp_path / name)] == [1]
+    assert frame_path(name, 2) == Path(name.replace("####", "0002"))
+
+
+def test_a_range_that_cannot_be_read_is_quoted_as_it_was_given(tmp_path):
+    with pytest.raises(UsageError, match=r"shot\.2024-11-23####\.exr: 2024-11-23: not a frame range") as caught:
+        expand(tmp_path / "shot.2024-11-23####.exr")
+    assert "--frames" not in str(caught.value)
+    with pytest.raises(UsageError, match="^'1-': not a frame range"):
+        parse_frames("1-")
+    with pytest.raises(UsageError, match="^--seeds 1-: not a frame range"):
+        parse_frames("1-", "--seeds 1-")
+
+
 def test_a_range_with_a_single_file_is_a_usage_error(shot):
     with pytest.raises(UsageError, match="no pattern such as ####"):
         expand(shot / "shot.1001.exr", "1001")

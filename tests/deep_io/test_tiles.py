@@ -4,11 +4,12 @@ import struct
 from dataclasses import replace
 
 import numpy as np
+import OpenEXR
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deep_io import DeepReader, InputError, Window, read_deep
+from deep_io import DeepReader, InputError, Window, read_deep, write_deep
 from deep_io.attributes import attribute
 from deep_io.header import encode_header, parse_headers
 from deep_io.samples import concatenate
@@ -57,6 +58,17 @@ def test_blocks_are_whole_rows_of_tiles(tiled, max_bytes):
         blocks = list(reader.blocks(max_bytes))
     assert all((block.window.ymin - 3) % TILE[1] == 0 for block in blocks)
     assert_same(concatenate(blocks), samples)
+
+
+def test_a_tiled_file_of_random_order_is_written_again_as_rows_that_increase(tmp_path):
+    samples = random_samples(smooth=True)
+    write_openexr(tmp_path / "tiled.exr", openexr_part(samples, tile=TILE, lineOrder=OpenEXR.RANDOM_Y))
+    read, header = read_deep(tmp_path / "tiled.exr")
+    assert header.line_order == "random"
+    write_deep(tmp_path / "rows.exr", read, header)
+    again, written = read_deep(tmp_path / "rows.exr")
+    assert (written.type, written.line_order) == ("deepscanline", "increasing")
+    assert_same(again, samples)
 
 
 def test_smaller_levels_are_passed_over(tiled):

@@ -64,6 +64,12 @@ def changed(samples: DeepSamples, **channels: np.ndarray) -> DeepSamples:
     return DeepSamples(samples.counts, {**samples.channels, **replaced}, samples.window)
 
 
+def without_samples(window: Window = WINDOW) -> DeepSamples:
+    """The channels of `noisy_scene` with not one sample."""
+    channels = {name: values[:0] for name, values in noisy_scene(0, window).channels.items()}
+    return DeepSamples(np.zeros((window.height, window.width), np.int32), channels, window)
+
+
 def random_weights(path: Path, seed: int = 0, **config_changes: Any) -> Path:
     """Weights of a small untrained network: what it must get right, it must get right without training."""
     torch.manual_seed(seed)

@@ -13,7 +13,7 @@ import OpenEXR
 import pytest
 
 from deep_io import DeepSamples, Window, write_deep
-from tests.end_to_end.scenes import changed, noisy_scene, random_weights, write_scene
+from tests.end_to_end.scenes import changed, noisy_scene, random_weights, without_samples, write_scene
 from tests.runner import Finished, Runner, environment, in_process, installed
 
 SMALL = Window(0, 0, 15, 11)
@@ -77,6 +77,19 @@ def no_sample(path: Path) -> None:
     write_deep(path, DeepSamples(np.zeros((4, 4), np.int32), channels, Window(0, 0, 3, 3)))
 
 
+def empty_packed(path: Path) -> None:
+    write_scene(path, without_samples(SMALL), lbmc__weighting="packed")
+
+
+def nothing_but_nan(path: Path) -> None:
+    samples = small()
+    write_scene(path, changed(samples, R=np.full(samples.total, np.nan, np.float16)))
+
+
+def empty_over(path: Path) -> None:
+    write_scene(path, without_samples(SMALL), lbmc__weighting="over")
+
+
 def unknown_compression(path: Path) -> None:
     write_scene(path, small())
     whole = bytearray(path.read_bytes())
@@ -108,6 +121,7 @@ BAD_FILES: list[tuple[Callable[[Path], None], tuple[str, ...]]] = [
     (corrupt_row, ("row 11",)),
     (promises_too_much, ("30000",)),
     (no_sample, ("no sample",)),
+    (empty_packed, ("no sample",)),
     (unknown_compression, ("compress",)),
     (uint_radiance, ("uint",)),
     (not_an_exr, ("not an EXR",)),
@@ -188,6 +202,8 @@ print("torch" in sys.modules)
     ("9", 3, ("in.0009.exr", "no such file")),
     ("none.exr", 3, ("none.exr", "no such file")),
     ("flat.exr", 3, ("flat.exr", "is a flat EXR")),
+    ("nan.exr", 3, ("nan.exr", "no sample has a finite radiance; render the frame again")),
+    ("empty.exr", 3, ("empty.exr", "no sample anywhere, so it cannot decide for others")),
 ])
 def test_a_bad_exposure_frame_fails_the_job_once_and_before_the_work(
     frame: str, code: int, words: tuple[str, ...], weights: Path, tmp_path: Path
@@ -195,6 +211,8 @@ def test_a_bad_exposure_frame_fails_the_job_once_and_before_the_work(
     for number in (1, 2):
         write_scene(tmp_path / f"in.{number:04d}.exr", small())
     flat(tmp_path / "flat.exr")
+    nothing_but_nan(tmp_path / "nan.exr")
+    empty_over(tmp_path / "empty.exr")
     run = in_process("denoise", "in.####.exr", "out.####.exr", "--model", weights, "--exposure-from", frame,
                      cwd=tmp_path)
     assert_refused(run, tmp_path / "out.0001.exr", *words, code=code)

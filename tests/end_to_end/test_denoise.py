@@ -26,6 +26,7 @@ from tests.end_to_end.scenes import (
     random_weights,
     read_flat,
     rgb,
+    without_samples,
     write_scene,
 )
 from tests.runner import LBMC, Runner, environment, in_process, installed
@@ -197,6 +198,55 @@ def test_a_frame_of_nothing_but_broken_samples_fails_and_is_not_written_black(we
     assert list(tmp_path.iterdir()) == [source]
 
 
+def test_a_first_frame_of_nothing_but_broken_samples_does_not_decide_for_the_shot(
+    weights: Path, tmp_path: Path
+) -> None:
+    for number in (1, 2, 3):
+        scene = noisy_scene(number, TINY)
+        darker = {name: scene.channels[name] * np.float16(0.02) for name in "RGB"}
+        write_scene(tmp_path / f"in.{number}.exr", changed(scene, **darker))
+    broken = noisy_scene(1, TINY)
+    write_scene(tmp_path / "in.1.exr", changed(broken, R=np.full_like(broken.channels["R"], np.nan)))
+    words = ("denoise", tmp_path / "in.#.exr", "--model", weights, "--exposure-from", "2")
+    assert in_process(*words, tmp_path / "named.#.exr", "--frames", "2-3").code == 0
+    run = in_process(*words[:-2], tmp_path / "out.#.exr")
+    assert run.code == 1
+    assert "in.1.exr: no sample has a finite radiance" in run.err
+    for number in (2, 3):
+        assert (tmp_path / f"out.{number}.exr").read_bytes() == (tmp_path / f"named.{number}.exr").read_bytes()
+
+
+@pytest.mark.parametrize("words", [(), ("--no-adapt",)])
+def test_an_over_frame_without_samples_is_black_and_transparent_and_decides_nothing(
+    words: tuple[str, ...], weights: Path, tmp_path: Path
+) -> None:
+    """An element that is not in the picture yet, or no more."""
+    for number in (1, 2, 3):
+        scene = noisy_scene(number, TINY) if number == 2 else without_samples(TINY)
+        write_scene(tmp_path / f"in.{number}.exr", scene, lbmc__weighting="over")
+    words = ("--model", weights, *words)
+    run = in_process("denoise", tmp_path / "in.#.exr", tmp_path / "out.#.exr", *words)
+    assert run.code == 0, run.err
+    assert in_process("denoise", tmp_path / "in.2.exr", tmp_path / "alone.exr", *words).code == 0
+    assert (tmp_path / "out.2.exr").read_bytes() == (tmp_path / "alone.exr").read_bytes()
+    for number in (1, 3):
+        channels, _ = read_flat(tmp_path / f"out.{number}.exr")
+        assert set(channels) == {"R", "G", "B", "A"}
+        assert all(pixels.shape == (TINY.height, TINY.width) and not pixels.any() for pixels in channels.values())
+
+
+def test_a_budget_that_no_band_is_small_enough_for_is_told_once(weights: Path, tmp_path: Path) -> None:
+    for number in (1, 2):
+        write_scene(tmp_path / f"in.{number}.exr", noisy_scene(number, TINY))
+    words = ("denoise", tmp_path / "in.#.exr", tmp_path / "out.#.exr", "--model", weights, "--memory")
+    run = in_process(*words, "2MiB")
+    assert run.code == 0
+    told = [line for line in run.err.splitlines() if "--memory" in line]
+    assert len(told) == 1
+    assert re.search(r"in\.1\.exr: needs about 0\.\d+ GiB .*, more than the 0\.00195 GiB of --memory", told[0])
+    assert "--memory" not in in_process(*words, "4GiB", "--overwrite").err
+
+
 def test_kept_channels_are_the_pixel_means_of_their_finite_values(weights: Path, tmp_path: Path) -> None:
     samples = noisy_scene(0, TINY)
     lens = samples.channels["lens.X"].copy()
@@ -226,6 +276,22 @@ def test_a_glob_of_channels_to_keep_passes_ids_by_and_a_name_does_not(weights: P
     assert "--ids coid" in refused.err
     assert in_process(*words, "co*").code == 0
     assert set(read_flat(tmp_path / "out.exr")[0]) == {"R", "G", "B", "A", "coc"}
+
+
+def test_a_glob_of_channels_to_keep_passes_the_hashes_of_a_cryptomatte_by(weights: Path, tmp_path: Path) -> None:
+    samples = noisy_scene(0, TINY)
+    hashes = np.ones(samples.total, np.float32)
+    source = write_scene(tmp_path / "in.exr", changed(samples, object00__R=hashes, object00__G=hashes),
+                         **{"cryptomatte/abcdefg/name": "object"})
+    words = ("denoise", source, tmp_path / "out.exr", "--model", weights, "--keep")
+    assert in_process(*words, "*").code == 0
+    kept = set(read_flat(tmp_path / "out.exr")[0])
+    assert "coc" in kept
+    assert not [name for name in kept if name.startswith("object")]
+    (tmp_path / "out.exr").unlink()
+    refused = in_process(*words, "object00")
+    assert refused.code == 3
+    assert "--ids object to" in refused.err
 
 
 def test_the_beautys_own_channels_cannot_be_kept_and_globs_pass_them_by(weights: Path, tmp_path: Path) -> None:

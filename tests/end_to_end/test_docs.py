@@ -111,3 +111,4 @@ def test_the_file_that_the_format_page_writes_is_a_deep_sample_file(tmp_path: Pa
     run = in_process("info", tmp_path / "shot.deep.exr")
     assert run.code == 0, run.err
     assert "weighting   uniform" in run.out
+    assert "lbmc:weighting" in run.out  # said by the header: a fractional alpha stops no job

@@ -127,6 +127,8 @@ def test_sequence_tells_wrong_options_from_unsuitable_input(weights: Path, tmp_p
     missing = run("sequence.sh", *words, "1001-1004", weights=weights, cwd=tmp_path)
     assert missing.code == 3
     assert "1002-1004" in missing.err
+    assert "nothing was written" in missing.err
+    assert not list(tmp_path.glob("beauty.*"))
 
 
 def test_chunks_of_a_shot_give_the_frames_of_one_job(weights: Path, tmp_path: Path) -> None:

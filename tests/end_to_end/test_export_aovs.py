@@ -138,9 +138,11 @@ def test_ids_go_with_the_beauty_of_the_flat_forms(weights: Path, source: Path, t
         (["--aov", "rim"], "no AOV 'rim'; there are"),
         (["--aov", "id"], "--ids id"),
         (["--aov", "RGB"], "fill"),
+        (["--aov", "key", "--aov", "key.R"], "in.exr: --aov key.R: key.R is written by --aov key already"),
+        (["--map", "radiance=key", "--aov", "fog", "--aov", "R"], "in.exr: --aov R: R is the beauty's name"),
     ],
 )
-def test_an_aov_that_is_not_there_or_is_an_id(
+def test_an_aov_that_is_not_there_is_an_id_or_has_a_name_that_is_taken(
     command: str, words: list[str], said: str, weights: Path, source: Path, tmp_path: Path
 ) -> None:
     run = in_process(command, source, tmp_path / "out.exr", "--model", weights, *words)

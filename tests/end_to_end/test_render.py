@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("mitsuba")
+from tests.runner import LBMC, environment, require_renderer
 
-from tests.runner import LBMC, environment
+require_renderer()
 
 TINY = ("--layout", "tabletop", "--size", 16, "--samples", 2, "--no-motion", "--workers", 2, "--threads", 1,
         "--progress", "none")

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ import torch
 
 from deep_io.flat import write_flat
 from model import zoo
-from model.config import OPTIMIZED
+from model.config import FAST, OPTIMIZED
 from model.denoiser import Denoiser
 from tests.pipelines.training_data import SIZE, uneven, write_example
 from tests.runner import LBMC, environment, in_process
@@ -187,7 +188,7 @@ def lose_data(data: Path, held: Path) -> None:
     ("damage", "named"),
     [
         (lose_reference, "data/a.deep.exr: its reference a.ref.exr is missing"),
-        (shrink_reference, "data/a.ref.exr: 7x40 pixels, but a.deep.exr has 40x40"),
+        (shrink_reference, "data/a.ref.exr: 7x40 pixels at (0, 0), but a.deep.exr has 40x40 pixels at (0, 0)"),
         (poison_reference, "held/c.ref.exr: NaN or Inf in the reference"),
         (leave_one, "data: 1 scene; 2 or more are needed"),
         (leave_none_held, "held: no *.deep.exr files"),
@@ -219,7 +220,7 @@ def test_weights_recipes_and_folders_that_do_not_fit_are_refused_before_training
     start = ("train", folder / "data", tmp_path / "run", "--validation", folder / "held", *QUICK)
     onto = ("train", folder / "data", folder / "whole", "--validation", folder / "held", *QUICK)
     cases = [
-        ((*start, "--start", other), "other.safetensors: its network, 'optimized', is not the 'fast'"),
+        ((*start, "--network", "fast", "--start", other), "its network, 'optimized', is not the 'fast'"),
         ((*start, "--start", tmp_path / "none.safetensors"), "none.safetensors: no such weight file"),
         ((*onto, "--network", "optimized"), "whole/checkpoint.pt: its network, 'fast', is not the 'optimized'"),
         ((*onto, "--seed", 5), "whole/checkpoint.pt: was made by another recipe (differs in seed)"),
@@ -235,3 +236,12 @@ def test_weights_recipes_and_folders_that_do_not_fit_are_refused_before_training
         assert done.err.startswith("ERROR: ")
         assert named in done.err
     assert not (tmp_path / "run").exists()
+
+
+def test_without_a_network_named_that_of_the_starting_weights_is_trained(folder: Path, tmp_path: Path) -> None:
+    mine = replace(FAST, name="mine", affinity_features=4)
+    zoo.save(Denoiser(mine), tmp_path / "mine.safetensors", {})
+    done = in_process("train", folder / "data", tmp_path / "run", "--validation", folder / "held", *QUICK,
+                      "--start", tmp_path / "mine.safetensors")
+    assert done.code == 0, done.err
+    assert zoo.find(str(tmp_path / "run" / "mine.safetensors")).config == mine

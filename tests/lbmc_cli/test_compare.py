@@ -93,7 +93,7 @@ def test_without_flip_evaluator_it_is_said_what_is_missing(
     run = in_process("compare", *pair)
     assert run.code == 0
     assert "FLIP" not in run.out
-    assert "pip install 'lbmc[bench]'" in run.err
+    assert "install lbmc with its extra 'bench'" in run.err
     assert in_process("compare", *pair, "--no-flip").err == ""
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deep_io import DeepSamples, Window
+from deep_io import DeepSamples, Header, Window, write_deep
 from tests.end_to_end.scenes import changed, noisy_scene, write_scene
-from tests.runner import Runner, in_process
+from tests.runner import Runner, in_process, installed
 
 SMALL = Window(2, 3, 17, 14)
 
@@ -36,6 +36,29 @@ def test_json_is_valid_and_complete(lbmc: Runner, source: Path) -> None:
     assert found["samples_per_pixel"]["max"] == [4]
     assert found["weighting"] == "uniform"
     assert set(found["roles"]) == {"radiance", "coverage", "depth", "normal", "albedo", "roughness", "coc", "lens"}
+
+
+def test_header_text_that_is_not_utf8_is_shown_escaped(tmp_path: Path) -> None:
+    source = write_scene(tmp_path / "in.exr", noisy_scene(0, SMALL), owner="caf\udce9")  # Latin-1, as it is read
+    run = installed("info", source, env={"PYTHONIOENCODING": "utf-8:strict"})
+    assert (run.code, run.err) == (0, "")
+    assert "caf\\udce9" in run.out
+    assert "samples " in run.out
+
+
+def test_json_says_null_of_attributes_that_are_not_finite(lbmc: Runner, tmp_path: Path) -> None:
+    samples = noisy_scene(0, SMALL)
+    header = Header.of_samples(samples).with_attributes(
+        {"far": float("inf"), "gain": float("nan"), "near": 0.5, "span": (1.0, float("-inf"))})
+    write_deep(tmp_path / "in.exr", samples, header)
+
+    def refuse(word: str) -> None:
+        raise AssertionError(f"{word} is no JSON")
+
+    found = json.loads(lbmc("info", tmp_path / "in.exr", "--json").out, parse_constant=refuse)
+    attributes = found["parts"][0]["attributes"]
+    assert {name: attributes[name] for name in ("far", "gain", "near", "span")} == {
+        "far": None, "gain": None, "near": 0.5, "span": [1, None]}
 
 
 def test_map_moves_and_drops_roles(source: Path) -> None:

@@ -37,8 +37,8 @@ def assert_same(first: Layers, second: Layers, tolerance: float = 1e-9) -> None:
 
 @torch.no_grad()
 def run(net: Denoiser, samples: Samples, scale: FrameScale = SCALE, layers: int | None = None,
-        fill: bool = True) -> Layers:
-    result: Layers = net(samples, scale, layers, fill)
+        fill: bool = True, decoded: torch.Tensor | None = None) -> Layers:
+    result: Layers = net(samples, scale, layers, fill, decoded=decoded)
     return result
 
 
@@ -190,6 +190,29 @@ def test_tiles_with_a_halo_change_nothing(variant: str) -> None:
         inner = tile[..., top - rows.start : bottom - rows.start, left - cols.start : right - cols.start]
         expected = planes(whole)[..., top:bottom, left:right]
         error = (inner - expected).abs().amax((0, 1, 3, 4)) / scale
+        assert float(error.max()) < 1e-5
+
+
+@pytest.mark.parametrize("variant", [name for name in VARIANTS if SMALL[name].kernel == "affinity"])
+def test_tiles_that_share_a_context_need_less_of_a_halo(variant: str) -> None:
+    net = random_network(SMALL[variant], 5, torch.float32)
+    assert net.tile_reach is not None
+    assert net.tile_reach < net.reach
+    halo = -(-net.tile_reach // net.stride) * net.stride
+    height, width = 2 * halo + 3 * net.stride + 5, net.stride + 3
+    samples = random_samples(6, (1, height, width), random_counts(6, height * width, 3, 0.2), dtype=torch.float32)
+    whole = run(net, samples, fill=False)
+    scale = planes(whole).abs().amax((0, 1, 3, 4))
+    with torch.no_grad():
+        decoded = net.decoded_context(net.unet_inputs(samples, SCALE))
+    for top in (0, halo + net.stride, 2 * halo + 3 * net.stride):
+        bottom = min(top + net.stride + 4, height)
+        rows = slice(max(top - halo, 0), min(bottom + net.tile_reach, height))
+        padded = -(-(rows.stop - rows.start) // net.config.unet.stride) * net.config.unet.stride
+        part = slice(rows.start // net.config.unet.scale, (rows.start + padded) // net.config.unet.scale)
+        tile = planes(run(net, crop(samples, rows, slice(None)), fill=False, decoded=decoded[:, :, part]))
+        inner = tile[..., top - rows.start : bottom - rows.start, :]
+        error = (inner - planes(whole)[..., top:bottom, :]).abs().amax((0, 1, 3, 4)) / scale
         assert float(error.max()) < 1e-5
 
 

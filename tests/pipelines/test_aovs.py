@@ -54,7 +54,8 @@ def test_lights_come_before_data_as_the_reader_carries_them() -> None:
     [
         ("rim", "no AOV 'rim'; there are .*key.*fog"),
         ("id", "--ids id"),
-        ("crypto00", "--ids crypto00"),
+        ("crypto00", "--ids crypto writes"),
+        ("crypto00.G", "--ids crypto writes"),
         ("R", "the beauty itself"),
         ("radiance", "the beauty itself"),
         ("A", "the beauty itself"),
@@ -63,6 +64,32 @@ def test_lights_come_before_data_as_the_reader_carries_them() -> None:
 def test_unknown_names_ids_and_the_beauty_are_refused(name: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         find(name)
+
+
+@pytest.mark.parametrize("name", ["R", "A", "Z"])
+def test_an_aov_cannot_take_the_name_of_the_beauty_or_of_another_depth(name: str) -> None:
+    header = Header(channels_of(dict.fromkeys((*"RGBAZ", *"XYW", "far.Z", "key.R", "key.G", "key.B"), np.float32)),
+                    WINDOW, WINDOW)
+    mapping = map_roles(header.channel_names, {"radiance": "key", "coverage": "W", "depth": "far"})
+    with pytest.raises(InputError, match=f"in.exr: --aov {name}: {name} is the .* name in an output"):
+        find_aovs(["X", name], header, mapping, "in.exr")
+    assert find_aovs(["depth"], header, mapping, "in.exr").depth == "Z"
+
+
+@pytest.mark.parametrize(("first", "second", "channel"), [
+    ("key", "key.R", "key.R"), ("key.G", "key", "key.G"), ("depth", "Z", "Z"), ("N", "normal", "N.X"),
+])
+def test_two_aovs_cannot_write_the_same_channel(first: str, second: str, channel: str) -> None:
+    with pytest.raises(InputError, match=f"in.exr: --aov {second}: {channel} is written by --aov {first} already"):
+        find(first, second)
+
+
+def test_the_depth_is_one_aov_whatever_it_is_called() -> None:
+    header = Header(channels_of(dict.fromkeys((*"RGBA", "far.Z"), np.float32)), WINDOW, WINDOW)
+    mapping = map_roles(header.channel_names, {"depth": "far"})
+    assert find_aovs(["far.Z"], header, mapping, "in.exr").depth == "far.Z"
+    with pytest.raises(InputError, match="--aov depth: Z is written by --aov far.Z already"):
+        find_aovs(["far.Z", "depth"], header, mapping, "in.exr")
 
 
 def test_the_beautys_aovs_are_sums_and_its_depth_a_mean() -> None:

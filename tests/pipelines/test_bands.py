@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.tiles import memory_needed, plan_bands
+from deep_io import Window
+from model.denoiser import Denoiser
+from pipelines.frame_context import strips
+from pipelines.frame_reader import FrameReader
+from pipelines.plan import fit
+from pipelines.tiles import Band, FrameLoad, plan_bands, within_reach
+from tests.end_to_end.scenes import noisy_scene, write_scene
+from tests.model.random_models import SMALL
 
 SIZES = st.integers(1, 3000)
 
 
-@given(height=SIZES, width=SIZES, per_pixel=st.floats(0, 64), reach=st.integers(0, 300),
+def uniform(height: int, width: int, per_pixel: int, layers: int = 2) -> FrameLoad:
+    return FrameLoad(width, np.full(height, width * per_pixel), layers)
+
+
+@given(height=SIZES, width=SIZES, per_pixel=st.integers(0, 64), reach=st.integers(0, 300),
        stride=st.sampled_from([1, 2, 16, 32]), memory=st.integers(1, 1 << 34))
 def test_bands_cover_the_frame_with_their_halos(
-    height: int, width: int, per_pixel: float, reach: int, stride: int, memory: int
+    height: int, width: int, per_pixel: int, reach: int, stride: int, memory: int
 ) -> None:
-    bands = plan_bands(height, width, per_pixel, reach, stride, memory)
+    bands = plan_bands(uniform(height, width, per_pixel), reach, None, stride, memory)
     assert [row for band in bands for row in range(band.y0, band.y1)] == list(range(height))
     for band in bands:
         assert band.read0 % stride == 0
@@ -24,14 +38,71 @@ def test_bands_cover_the_frame_with_their_halos(
         assert band.read1 == min(band.y1 + reach, height)
 
 
-@given(height=SIZES, width=SIZES, per_pixel=st.floats(0, 64))
-def test_one_band_when_the_budget_allows_it(height: int, width: int, per_pixel: float) -> None:
-    needed = memory_needed(height, width, per_pixel)
-    assert len(plan_bands(height, width, per_pixel, 100, 32, needed)) == 1
+@given(height=SIZES, width=SIZES, per_pixel=st.integers(0, 64), layers=st.integers(1, 5))
+def test_one_band_when_the_budget_allows_it(height: int, width: int, per_pixel: int, layers: int) -> None:
+    load = uniform(height, width, per_pixel, layers)
+    assert len(plan_bands(load, 100, 50, 32, load.needed(height))) == 1
+
+
+def tallest(bands: list[Band]) -> int:
+    return max(band.read1 - band.read0 for band in bands)
 
 
 def test_a_smaller_budget_gives_shorter_bands_within_it() -> None:
-    whole = memory_needed(2000, 1920, 8)
-    bands = plan_bands(2000, 1920, 8, 100, 32, whole // 2)
-    assert 1 < len(bands) < 20
-    assert max(memory_needed(band.read1 - band.read0, 1920, 8) for band in bands) <= whole // 2
+    load = uniform(2000, 1920, 8)
+    budget = load.needed(2000) // 2
+    bands, shared = plan_bands(load, 100, None, 32, budget), plan_bands(load, 400, 100, 32, budget)
+    assert 1 < len(bands) <= len(shared) < 20
+    assert load.needed(tallest(bands)) <= budget
+    assert load.needed_shared(tallest(shared)) <= budget
+
+
+def test_bands_fit_where_samples_are_densest() -> None:
+    samples = np.full(2000, 1920 * 4)
+    samples[700:1200] = 1920 * 64
+    load = FrameLoad(1920, samples, 2)
+    assert load.most_samples(500) == 500 * 1920 * 64
+    assert load.most_samples(3000) == samples.sum()
+    budget = load.needed(2000) * 2 // 3
+    bands = plan_bands(load, 100, None, 32, budget)
+    for band in bands:
+        held = FrameLoad(1920, samples[band.read0 : band.read1], 2)
+        assert held.needed(held.height) <= budget
+    assert len(bands) > len(plan_bands(uniform(2000, 1920, 4), 100, None, 32, budget))
+
+
+def test_a_frame_is_kept_only_where_that_costs_no_band_and_fits(tmp_path: Path) -> None:
+    write_scene(tmp_path / "in.exr", noisy_scene(1, Window(0, 0, 40, 700)))
+    net = Denoiser(SMALL["fast"])
+    with FrameReader(tmp_path / "in.exr") as reader:
+        whole = fit(reader, net, 2, 1 << 40)
+        assert (len(whole.bands), whole.keep) == (1, True)
+        for budget in (whole.memory - 1, whole.memory - reader.kept_bytes, 1):
+            room = fit(reader, net, 2, budget)
+            assert len(room.bands) > 1
+            assert not room.keep or room.memory <= budget
+
+
+@given(height=SIZES, first=SIZES, last=SIZES, rows=SIZES, stride=st.sampled_from([1, 2, 16, 32]))
+def test_strips_cover_what_is_looked_at_with_a_stride_around(
+    height: int, first: int, last: int, rows: int, stride: int
+) -> None:
+    first = first % height // stride * stride
+    last = first + 1 + last % (height - first)
+    found = strips(first, last, height, rows, stride)
+    assert [row for strip in found for row in range(strip.y0, strip.y1)] == list(range(first, last))
+    for strip in found:
+        assert strip.y0 % stride == strip.read0 % stride == 0
+        assert strip.read0 == max(strip.y0 - stride, 0)
+        assert strip.read1 >= min(strip.y1 + stride, height)
+        assert strip.read1 - strip.read0 <= max(rows, 3 * stride)
+
+
+@given(busy=st.lists(st.booleans(), min_size=1, max_size=200), reach=st.integers(0, 50),
+       stride=st.sampled_from([1, 2, 16, 32]))
+def test_all_that_busy_rows_see_is_within_reach(busy: list[bool], reach: int, stride: int) -> None:
+    first, last = within_reach(np.array(busy), reach, stride)
+    assert first % stride == 0
+    seen = {row for k, one in enumerate(busy) if one for row in range(max(k - reach, 0), min(k + reach + 1, len(busy)))}
+    assert seen <= set(range(first, last))
+    assert bool(seen) == (last > first)

@@ -9,10 +9,11 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 
-from deep_io import read_deep
+from deep_io import Window, read_deep
 from deep_io.errors import InputError, UsageError
 from model.config import LAYER, SAMPLE_SPLAT
 from model.cost import count
@@ -24,8 +25,9 @@ from pipelines.bench.memory import measurable, peak_memory
 from pipelines.bench.methods import MethodSpec, make, method_specs
 from pipelines.bench.report import Gallery
 from pipelines.bench.results import Measurement, Results, SceneInfo, pareto
-from pipelines.bench.scenes import enlarge, find_scenes, thin, write_thinned
+from pipelines.bench.scenes import enlarge, find_scenes, thin, write_enlarged, write_thinned
 from pipelines.bench.tables import memory_frames
+from tests.deep_io.deep_files import openexr_part, write_openexr
 from tests.end_to_end.bench_scenes import WINDOW, write_pair
 from tests.end_to_end.scenes import noisy_scene
 from tests.model.random_models import SMALL
@@ -117,6 +119,16 @@ def test_a_thinned_file_is_the_scene_with_fewer_samples(tmp_path: Path) -> None:
     samples, header = read_deep(tmp_path / "two.exr")
     assert (samples.counts == 2).all()
     assert header.data_window == read_deep(scene.source)[1].data_window
+
+
+def test_tiles_in_random_order_are_thinned_and_enlarged(tmp_path: Path) -> None:
+    samples = write_pair(tmp_path, "scene", 1)
+    write_openexr(tmp_path / "scene.deep.exr", openexr_part(samples, tile=(16, 8), lineOrder=OpenEXR.RANDOM_Y))
+    (scene,) = find_scenes(tmp_path)
+    write_thinned(scene, 2, tmp_path / "two.exr")
+    assert (read_deep(tmp_path / "two.exr")[0].counts == 2).all()
+    assert write_enlarged(scene, 40, tmp_path / "large.exr") == 0.0016
+    assert read_deep(tmp_path / "large.exr")[1].data_window == Window(0, 0, 39, 39)
 
 
 def test_an_enlarged_scene_is_its_mirror_images() -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from deep_io import DeepSamples, Header, InputError, Window, write_deep
+from deep_io import DeepSamples, DeepWriter, Header, InputError, Window, write_deep
 from deep_io.attributes import attribute
 from pipelines.info import file_info
 
@@ -99,6 +100,23 @@ def test_the_header_is_shown_and_json_is_plain(small: Path) -> None:
         "1 of them misses",
     ):
         assert expected in text
+
+
+def test_the_part_that_was_read_is_told(tmp_path: Path) -> None:
+    channels = {name: np.ones(2, np.float16) for name in "RGB"}
+    samples = DeepSamples(np.ones((1, 2), np.int32), channels, Window(0, 0, 1, 0))
+    headers = [replace(Header.of_samples(samples), name=name) for name in ("left", "right")]
+    with DeepWriter(tmp_path / "two.exr", headers) as writer:
+        for part in (0, 1):
+            writer.write(samples, part)
+    assert [file_info(tmp_path / "two.exr", part=name).part for name in ("left", "right", "1")] == [0, 1, 1]
+
+
+def test_broken_values_that_are_finite_are_repairs_too(tmp_path: Path) -> None:
+    channels = {"R": [1.0, 1], "G": [1, 1], "B": [1, 1], "Z": [-1, 2]}
+    assert file_info(write(tmp_path / "negative.exr", [[2]], channels)).as_dict()["repairs"] == {"depth": 1}
+    sound = file_info(write(tmp_path / "sound.exr", [[2]], {**channels, "Z": [1, 2]}))
+    assert "repaired    nothing: no value is broken" in sound.lines()
 
 
 def test_fractional_alpha_without_a_weighting_is_refused(tmp_path: Path) -> None:

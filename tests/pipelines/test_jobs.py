@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
 from deep_io.errors import InputError, UsageError
 from pipelines.jobs import FrameSkippedError, JobReport, describe_error, run_frames
@@ -67,4 +68,9 @@ def test_errors_are_described_in_one_line() -> None:
     assert describe_error(InputError("a.exr:\nis flat")) == "a.exr: is flat"
     assert describe_error(PermissionError(13, "Permission denied", "b.exr")) == "b.exr: Permission denied"
     assert "--memory" in describe_error(MemoryError())
+    with pytest.raises(RuntimeError) as caught:
+        torch.empty(1 << 52)
+    for error in (caught.value, torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 9.00 GiB.")):
+        assert describe_error(error) == "out of memory; pass a smaller --memory, or run on a machine with more"
+    assert "(unexpected" in describe_error(RuntimeError("mat1 and mat2 cannot be multiplied"))
     assert describe_error(KeyError("x")).startswith("KeyError: 'x' (unexpected")

@@ -19,7 +19,8 @@ from deep_io.errors import InputError, UsageError
 from deep_io.flat import FlatImage, read_flat, write_flat, write_flat_parts
 from deep_io.header import Header, channels_of
 from deep_io.path_samples import PathSamples, SampleReader
-from pipelines.pack import PackOptions, pack, pack_frames, plan
+from pipelines.pack import OVERFLOW, PackOptions, pack, pack_frames, plan
+from pipelines.survey import survey
 
 OIIOTOOL = Path(sys.executable).with_name("oiiotool")
 WIDTH, HEIGHT = 13, 9
@@ -246,6 +247,38 @@ def test_radiance_too_large_to_be_light_is_left_out_as_in_denoising(tmp_path):
     assert all(np.isfinite(values).all() for values in flat.values())
     np.testing.assert_allclose(flat["G"][4, 5], 1.5, rtol=HALF)
     np.testing.assert_allclose(flat["key.B"][1, 1], 1.0, rtol=HALF)
+
+
+def test_radiance_that_overflowed_half_is_kept_and_told_as_such(tmp_path):
+    pictures = [render(seed) for seed in range(3)]
+    pictures[0]["R"][4, 5] = pictures[1]["G"][2, 2] = np.inf
+    pictures[2]["B"][1, 1] = np.nan
+    out = tmp_path / "deep.exr"
+    report = pack(write_renders(tmp_path, pictures), out)
+    assert report is not None
+    assert +report.repairs == {"radiance": 1, OVERFLOW: 2}
+    told = [line for line in report.lines() if line.startswith(f"{out}: ") and "per pixel" not in line]
+    assert told == [f"{out}: 1 samples left out: their radiance is not finite, or beyond 1e+30",
+                    f"{out}: 2 samples of radiance stored as Inf, which in half is an overflow: read as 65504"]
+    samples = read(out)
+    assert (samples.counts[4, 5], samples.counts[2, 2], samples.counts[1, 1]) == (3, 3, 2)
+    np.testing.assert_allclose(samples.roles["radiance"].max(), 65504, rtol=HALF)
+
+
+def test_unknown_depths_stay_unknown_however_many_a_pixel_has(tmp_path):
+    pictures = [render(seed, fractions=False) for seed in range(4)]
+    for picture in pictures:
+        picture["Z"][picture["A"] > 0] = np.nan
+    pictures[0]["A"][5, 5], pictures[0]["Z"][5, 5] = 1, 7
+    out = tmp_path / "deep.exr"
+    report = pack(write_renders(tmp_path, pictures), out)
+    assert report is not None
+    assert report.repairs["depth"] > HEIGHT * WIDTH
+    samples = read(out)
+    hit = samples.coverage > 0
+    assert sorted(set(samples.roles["depth"][hit, 0].tolist())) == [0, 7]
+    assert not samples.repairs
+    assert survey([samples]).depth == 7
 
 
 def test_radiance_beyond_half_is_written_as_float(tmp_path):

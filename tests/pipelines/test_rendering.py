@@ -11,8 +11,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-pytest.importorskip("mitsuba")
-
 from deep_io import read_deep
 from deep_io.errors import InputError, UsageError
 from deep_io.flat import HALF_MAX, read_flat
@@ -27,7 +25,9 @@ from pipelines.rendering.stage import Stage
 from pipelines.rendering.stage_scene import StageTracer
 from pipelines.rendering.tracer import MISS_DEPTH, TIME_BINS, Motion
 from pipelines.rendering.views import CAMERA_MOTION_RANGE, View, add_camera_motion
-from tests.runner import in_process
+from tests.runner import in_process, require_renderer
+
+require_renderer()
 
 Array = npt.NDArray[np.float32]
 

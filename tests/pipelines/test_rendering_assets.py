@@ -211,5 +211,5 @@ def test_a_missing_mitsuba_gives_one_line_with_the_cure(monkeypatch: pytest.Monk
     monkeypatch.setitem(__import__("sys").modules, "mitsuba", None)
     monkeypatch.setattr(backend, "find_llvm", lambda: "/nowhere/libLLVM.so.19")
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/nowhere/libLLVM.so.19")
-    with pytest.raises(RendererMissingError, match=r"pip install 'lbmc\[render\]'"):
+    with pytest.raises(RendererMissingError, match="install lbmc with its extra 'render'"):
         backend.load_mitsuba.__wrapped__()

@@ -11,8 +11,10 @@ import pytest
 
 from deep_io.errors import InputError
 from deep_io.flat import write_flat
+from deep_io.header import Header
 from deep_io.path_samples import PathSamples, SampleReader
-from pipelines.training.cache import CHANNEL_COUNT, CHANNELS, SampleCache
+from deep_io.samples import Window
+from pipelines.training.cache import CHANNEL_COUNT, CHANNELS, SampleCache, read_index
 from pipelines.training.caching import build_cache, scene_files
 from tests.pipelines.training_data import COUNT, SIZE, uneven, write_example
 
@@ -109,6 +111,18 @@ def test_a_cached_scene_is_decoded_again_only_when_it_changed(scenes: Path, tmp_
     np.testing.assert_array_equal(mapped, held)  # a training that runs on the old arrays goes on undisturbed
 
 
+def test_what_another_run_cached_meanwhile_stays_in_the_index(scenes: Path, tmp_path: Path) -> None:
+    held: list[list[str]] = []
+
+    def report(_: str) -> None:
+        if not held:
+            build_cache(scenes, tmp_path / "cache")  # the other run: it starts later and is done first
+        held.append(sorted(read_index(tmp_path / "cache")))
+
+    build_cache(scenes, tmp_path / "cache", report)
+    assert held == [["scene0", "scene1", "scene2"]] * 3
+
+
 def test_a_scene_that_was_moved_away_is_no_longer_in_the_cache(scenes: Path, tmp_path: Path) -> None:
     copied = tmp_path / "data"
     shutil.copytree(scenes, copied)
@@ -124,6 +138,11 @@ def lose_reference(folder: Path) -> None:
 
 def shrink_reference(folder: Path) -> None:
     write_flat(folder / "scene1.ref.exr", dict.fromkeys("RGB", np.ones((SIZE, SIZE - 1), np.float32)))
+
+
+def shift_reference(folder: Path) -> None:
+    path, window = folder / "scene1.ref.exr", Window(3, 0, SIZE + 2, SIZE - 1)
+    write_flat(path, dict.fromkeys("RGB", np.ones((SIZE, SIZE), np.float32)), Header((), window, window))
 
 
 def poison_reference(folder: Path) -> None:
@@ -149,7 +168,8 @@ def truncate_deep(folder: Path) -> None:
     ("damage", "named"),
     [
         (lose_reference, "scene1.deep.exr: its reference scene1.ref.exr is missing"),
-        (shrink_reference, "scene1.ref.exr: 39x40 pixels, but scene1.deep.exr has 40x40"),
+        (shrink_reference, "scene1.ref.exr: 39x40 pixels at .0, 0., but scene1.deep.exr has 40x40 pixels at .0, 0."),
+        (shift_reference, "scene1.ref.exr: 40x40 pixels at .3, 0., but scene1.deep.exr has 40x40 pixels at .0, 0."),
         (poison_reference, "scene1.ref.exr: NaN or Inf"),
         (colourless_reference, "scene1.ref.exr: no channel R"),
         (black_reference, "scene1.ref.exr: .*no light"),
