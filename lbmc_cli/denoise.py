@@ -35,6 +35,8 @@ def denoise(**choices: Any) -> int:
     from pipelines.frames import find_frames
 
     find_frames(options)  # a missing input is said at once, not after the import of torch
+    from pipelines.allocator import keep_freed_memory
     from pipelines.denoise import denoise_frames
 
+    keep_freed_memory()
     return end_job(denoise_frames(options))

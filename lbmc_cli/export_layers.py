@@ -54,6 +54,8 @@ def export_layers(**choices: Any) -> int:
     from pipelines.frames import find_frames
 
     find_frames(options)  # a missing input is said at once, not after the import of torch
+    from pipelines.allocator import keep_freed_memory
     from pipelines.export import export_frames
 
+    keep_freed_memory()
     return end_job(export_frames(options))
