@@ -99,6 +99,8 @@ CHANGES = (
     Change(KERNELS, "a gate for each guide", replace(SMALL_FAST, guide_gates=3)),
     Change(KERNELS, "learned features of the divisor", replace(SMALL_FAST, divisor_features=4)),
     Change(LAYERS, "no guard of the entropy", recipe=replace(RECIPE, partition_entropy=0.0)),
+    Change(TRAINING, "Muon", recipe=replace(RECIPE, muon=True)),
+    Change(KERNELS, "9x9 finest window", replace(SMALL_FAST, kernel_sizes=(9, *SMALL_FAST.kernel_sizes[1:]))),
 )
 """In order of importance: what a short evening gets done."""
 

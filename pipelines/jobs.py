@@ -53,6 +53,8 @@ class JobReport(Generic[Value]):
     """How all frames went, in their order."""
 
     frames: tuple[FrameResult[Value], ...]
+    cpu_known: bool = True
+    """Whether the CPU seconds are the frames' own; those of other processes are not known."""
 
     @property
     def failed(self) -> tuple[FrameResult[Value], ...]:
@@ -83,7 +85,7 @@ class JobReport(Generic[Value]):
         if done:
             wall = sum(frame.seconds for frame in done) / len(done)
             cpu = sum(frame.cpu_seconds for frame in done) / len(done)
-            words.append(f"{wall:.2f} s a frame ({cpu:.2f} CPU s)")
+            words.append(f"{wall:.2f} s a frame" + (f" ({cpu:.2f} CPU s)" if self.cpu_known else ""))
         return ", ".join(words)
 
 
@@ -92,12 +94,14 @@ def run_frames(
     work: Callable[[Frame, Progress], Value],
     progress: Progress,
     label: Callable[[Frame], str] = str,
+    here: bool = True,
 ) -> JobReport[Value]:
     """Calls `work(frame, progress)` for every frame in order and returns how each went.
 
     `work` may call `progress.update` and `progress.note`; begin and finish happen here. An exception fails its frame
     only: it is told at once through `progress.fail` and kept in the report. FrameSkippedError skips the frame.
-    KeyboardInterrupt, StoppedError and other BaseExceptions end the job.
+    KeyboardInterrupt, StoppedError and other BaseExceptions end the job. `here`: the work is done by this process, so
+    that its CPU seconds are those of the frame.
     """
     results: list[FrameResult[Value]] = []
     for frame in frames:
@@ -119,7 +123,7 @@ def run_frames(
         results.append(FrameResult(name, seconds, cpu_seconds, value, error, skipped))
         progress.finish()
         raise_if_stopped()
-    return JobReport(tuple(results))
+    return JobReport(tuple(results), here)
 
 
 def describe_error(error: BaseException) -> str:

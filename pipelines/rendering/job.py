@@ -115,7 +115,8 @@ def render_scenes(options: RenderOptions, progress_kind: ProgressKind = "auto",
                 (report or progress.note)(line)
                 return line
 
-            done = run_frames(missing, work, progress, lambda seed: example_stem(options.outdir, seed).name)
+            done = run_frames(missing, work, progress, lambda seed: example_stem(options.outdir, seed).name,
+                              here=workers <= 1)
     complete = [example_stem(options.outdir, seed) for seed in seeds if _is_complete(options, seed)]
     if options.contact_sheet and complete:
         write_contact_sheet(options.outdir / CONTACT_SHEET, complete)

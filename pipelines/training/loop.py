@@ -25,6 +25,7 @@ from pipelines.signals import StoppedError, signals_noted
 from pipelines.training.batches import Batch, random_batch
 from pipelines.training.cache import SampleCache
 from pipelines.training.group import ALONE, Group
+from pipelines.training.optimizer import make_optimizer
 from pipelines.training.recipe import Recipe
 from pipelines.training.run_folder import RunFolder, State
 from pipelines.training.validation import UNIT, validate
@@ -33,7 +34,6 @@ TIME_IS_UP = 1  # below the numbers of the signals that end a run
 GUARDED = 1 / 3  # of the run, in which the guard against a collapsed partition fades
 ORDER_MARGIN = 0.02  # log units of depth by which a layer should be behind the one in front of it
 HOPELESS = 40  # steps in a row whose gradient is not finite: the weights have diverged, and would not change again
-BETAS = (0.9, 0.99)  # of Adam; steps are few and batches small, so its variance must not lag by a thousand steps
 
 Report = Callable[[str], None]
 
@@ -101,7 +101,7 @@ class Trainer:
         self.averaged.load_state_dict(self.net.state_dict())
         for net in (self.net, self.averaged):
             net.to(group.device)
-        self.optimizer = torch.optim.Adam(self.net.parameters(), lr=recipe.learning_rate, betas=BETAS)
+        self.optimizer = make_optimizer(self.net, recipe)
         self.state = State()
         found = self.folder.read(group.device)
         if found is not None:
@@ -207,12 +207,11 @@ class Trainer:
     def advance(self, batch: Batch) -> float:
         """One step on this process's part of its batch; returns the loss of the whole batch, NaN for a skipped step."""
         recipe, step = self.recipe, self.step
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate(step, recipe)
+        self.optimizer.set_rate(learning_rate(step, recipe))
         # DistributedDataParallel takes the mean over processes, whose parts may differ by a crop
         weight = len(batch.target) * self.group.size / recipe.batch
         loss = weight * self.objective(batch.to(self.group.device), step)
-        self.optimizer.zero_grad(set_to_none=True)
+        self.optimizer.zero_grad()
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.net.parameters(), recipe.clip)
         mean = self.group.mean(loss)

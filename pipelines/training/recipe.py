@@ -47,7 +47,11 @@ class Recipe:
     steps: Annotated[int, "length of the run"] = 4000
     batch: Annotated[int, "crops a step, of all processes together"] = 4
     crop: Annotated[int, "pixels along a crop's side; smaller where a scene is smaller"] = 128
-    learning_rate: Annotated[float, "of Adam, at its highest"] = 1e-3
+    learning_rate: Annotated[float, "of Adam, at its highest; Muon's steps are scaled to the size of Adam's"] = 1e-3
+    muon: Annotated[
+        bool, "matrices and convolutions are stepped by Muon, which makes a step's singular values alike, and only the "
+              "rest by Adam"
+    ] = False
     warmup: Annotated[int, "steps in which the learning rate rises"] = 50
     final_rate: Annotated[float, "share of `learning_rate` that a cosine reaches at the end"] = 0.02
     average: Annotated[float, "what the averaged weights, which are validated and written, keep each step"] = 0.999

@@ -1,7 +1,7 @@
 """The folder of one run: its checkpoint, recipe, curve, pictures and weights, each written whole or not at all.
 
     recipe.json        the whole recipe; `lbmc train --recipe` takes it
-    checkpoint.pt      weights, their average, Adam's moments, the curve so far
+    checkpoint.pt      weights, their average, the optimizer's moments, the curve so far
     curve.csv          one row a validation; curve.png shows it
     panels/            stepNNNNNN.png, some validation scenes
     PRESET.safetensors the averaged weights, once the run ends
@@ -25,6 +25,7 @@ from model import zoo
 from model.config import Config
 from model.denoiser import Denoiser
 from pipelines.training.drawing import can_draw, curve_png, panel_png
+from pipelines.training.optimizer import Optimizer
 from pipelines.training.recipe import Recipe, differences
 from pipelines.training.validation import Shown
 
@@ -83,7 +84,7 @@ class RunFolder:
                              f"another folder, or go on with --recipe {self.folder / RECIPE}")
         return found
 
-    def write(self, state: State, net: Denoiser, averaged: Denoiser, optimizer: torch.optim.Optimizer) -> None:
+    def write(self, state: State, net: Denoiser, averaged: Denoiser, optimizer: Optimizer) -> None:
         """Recipe, checkpoint and curve."""
         self.folder.mkdir(parents=True, exist_ok=True)
         with atomic_output(self.folder / RECIPE) as path:

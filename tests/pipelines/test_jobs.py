@@ -31,6 +31,12 @@ def test_a_failed_frame_does_not_stop_the_others() -> None:
     assert report.summary().startswith("2 of 3 frames done, 1 failed")
 
 
+def test_cpu_seconds_are_told_only_of_work_that_this_process_did() -> None:
+    here, elsewhere = (run_frames([1], lambda frame, _: frame, Progress(1), here=here) for here in (True, False))
+    assert here.summary().endswith(" CPU s)")
+    assert elsewhere.summary().endswith(" s a frame")
+
+
 @pytest.mark.parametrize(
     ("outcomes", "code"),
     [
