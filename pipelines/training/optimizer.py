@@ -59,8 +59,8 @@ class Optimizer:
         return {"parts": [part.state_dict() for part in self._parts]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """The inverse of `state_dict`."""
-        for part, saved in zip(self._parts, state["parts"], strict=True):
+        """The inverse of `state_dict`; also of Adam's own, which checkpoints held at first."""
+        for part, saved in zip(self._parts, state.get("parts", [state]), strict=True):
             part.load_state_dict(saved)
 
 

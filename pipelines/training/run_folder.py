@@ -78,7 +78,8 @@ class RunFolder:
         if config != self.config:
             raise UsageError(f"{path}: its network, {config.name!r}, is not the {self.config.name!r} of "
                              f"--network; train into another folder")
-        changed = list(differences(self.recipe.to_dict(), recipe))
+        # a field that a recipe does not name, since lbmc had it later, has its default
+        changed = list(differences(self.recipe.to_dict(), {**Recipe().to_dict(), **recipe}))
         if changed:
             raise UsageError(f"{path}: was made by another recipe (differs in {', '.join(changed)}); train into "
                              f"another folder, or go on with --recipe {self.folder / RECIPE}")

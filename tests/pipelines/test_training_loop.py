@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+import json
 import math
 import os
 import signal
@@ -322,6 +323,15 @@ def test_checkpoints_of_other_runs_and_broken_ones_are_refused_by_name(whole: Tr
     torch.save({"weights": 3}, broken)
     with pytest.raises(InputError, match=f"{CHECKPOINT}: not a checkpoint"):
         Trainer(SMALL, QUICK, tmp_path)
+
+
+def test_checkpoints_from_before_a_recipe_had_a_field_are_resumed(whole: Trainer, tmp_path: Path) -> None:
+    data = torch.load(whole.folder.folder / CHECKPOINT, weights_only=True)
+    recipe = json.loads(data["recipe"])
+    del recipe["muon"]
+    (adam,) = data["optimizer"]["parts"]
+    torch.save({**data, "recipe": json.dumps(recipe), "optimizer": adam}, tmp_path / CHECKPOINT)
+    assert Trainer(SMALL, QUICK, tmp_path).step == QUICK.steps
 
 
 def test_train_writes_weights_that_the_zoo_reads_and_training_starts_from(
