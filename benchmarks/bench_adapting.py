@@ -36,6 +36,7 @@ from pipelines.decisions import decide, zero_roles
 from pipelines.denoise import Job
 from pipelines.inference import denoise_bands
 from pipelines.options import DenoiseOptions
+from pipelines.scene_names import DEEP, reference_of, scene_name
 from pipelines.survey import Survey, survey
 from pipelines.tiles import Band
 
@@ -116,7 +117,7 @@ class Bench:
 
     def load(self, path: Path) -> Scene:
         with self.job.open(path) as reader:
-            return Scene.of(path.name.removesuffix(".deep.exr"), reader.read(), read_rgb(reference_of(path)).rgb)
+            return Scene.of(scene_name(path), reader.read(), read_rgb(reference_of(path)).rgb)
 
     def run(self, scene: Scene, choice: Choice) -> tuple[np.ndarray, float]:
         """The beauty (H, W, 3), and CPU seconds."""
@@ -143,10 +144,6 @@ class Bench:
         if kept is not None:
             change = np.abs(saving - plain).max(-1) / (np.abs(plain).max(-1) + 1e-3 * plain.mean())
             row.change.append(float(change[kept].max()))
-
-
-def reference_of(path: Path) -> Path:
-    return path.with_name(path.name.replace(".deep.exr", ".ref.exr"))
 
 
 def picked(samples: PathSamples, rows: np.ndarray, columns: np.ndarray) -> PathSamples:
@@ -243,7 +240,7 @@ def main() -> None:
     options = parser.parse_args()
     bench, scenes = Bench(options.model, options.repeats), []
     for folder in options.folders:
-        paths = [path for path in sorted(folder.glob("*.deep.exr")) if reference_of(path).exists()]
+        paths = [path for path in sorted(folder.glob(f"*{DEEP}")) if reference_of(path).exists()]
         if not paths:
             sys.exit(f"ERROR: {folder}: no NAME.deep.exr with a NAME.ref.exr beside it")
         scenes += [bench.load(path) for path in paths]

@@ -30,6 +30,7 @@ from pipelines.compare import read_rgb
 from pipelines.oidn import Oidn
 from pipelines.options import DenoiseOptions
 from pipelines.pictures import panel
+from pipelines.scene_names import DEEP, reference_of, scene_name
 
 Picture = np.ndarray
 """(H, W, 3) linear RGB."""
@@ -44,7 +45,7 @@ class Scene:
 
     @property
     def name(self) -> str:
-        return self.path.name.removesuffix(".deep.exr")
+        return scene_name(self.path)
 
     @property
     def per_pixel(self) -> int:
@@ -98,15 +99,11 @@ def lbmc_method(model: str, threads: int | None, adapt: bool, layers: int | None
 
 def find_scenes(folder: Path, match: str) -> list[Path]:
     """Deep sample files of a folder that have a reference. Ends the program when there are none."""
-    paths = [path for path in sorted(folder.glob("*.deep.exr")) if fnmatch(path.name, match)]
+    paths = [path for path in sorted(folder.glob(f"*{DEEP}")) if fnmatch(path.name, match)]
     paths = [path for path in paths if reference_of(path).exists()]
     if not paths:
         sys.exit(f"ERROR: {folder}: no NAME.deep.exr with a NAME.ref.exr beside it matches {match!r}")
     return paths
-
-
-def reference_of(path: Path) -> Path:
-    return path.with_name(path.name.replace(".deep.exr", ".ref.exr"))
 
 
 def cells(scores: Scores) -> str:

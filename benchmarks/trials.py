@@ -29,6 +29,7 @@ from pipelines.bench.methods import LbmcMethod
 from pipelines.bench.results import own
 from pipelines.bench.scenes import find_scenes, write_thinned
 from pipelines.compare import read_rgb
+from pipelines.scene_names import reference_of
 from pipelines.training.batches import random_batch
 from pipelines.training.cache import SampleCache, SceneArrays, SceneEntry
 from pipelines.training.job import open_cache
@@ -112,7 +113,7 @@ def thinned(sets: dict[str, Path], folder: Path) -> dict[str, Scenes]:
                 file = folder / name / scene.source.name
                 if not file.exists():
                     write_thinned(scene, SAMPLES, file)
-            reference = scene.source.with_name(scene.source.name.replace(".deep.exr", ".ref.exr"))
+            reference = reference_of(scene.source)
             found.setdefault(name, []).append((scene.name, file, reference))
     return found
 

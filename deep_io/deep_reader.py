@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_io import codec
+from deep_io.cores import usable_cores
 from deep_io.errors import InputError
 from deep_io.header import FileHeaders, Header, open_input, parse_headers
 from deep_io.library_reader import LibraryRows
@@ -172,5 +173,4 @@ def _pieces(first: int, last: int, size: int) -> list[range]:
 
 def default_threads() -> int:
     """The number of cores this process may use, at most 8."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(MAX_THREADS, cores)
+    return min(MAX_THREADS, usable_cores())

@@ -129,8 +129,10 @@ def open_input(path: str | os.PathLike[str]) -> BinaryIO:
     try:
         # Opening a pipe would wait for its writer, for ever if there is none.
         if not stat.S_ISREG(os.stat(path).st_mode):
-            what = "a folder" if os.path.isdir(path) else "a pipe or a device"
-            raise InputError(f"{os.fspath(path)}: is {what}, not a file; an EXR is read back and forth")
+            if os.path.isdir(path):
+                raise InputError(f"{os.fspath(path)}: is a folder; name an EXR file")
+            raise InputError(f"{os.fspath(path)}: is a pipe or a device, but an EXR is read back and forth; write it to "
+                             f"a file first")
         return open(path, "rb")  # The caller closes it.
     except OSError as error:
         raise InputError(f"{os.fspath(path)}: cannot be opened: {error.strerror or error}") from error

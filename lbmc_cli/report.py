@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
+    from deep_io.atomic import Existing
     from pipelines.jobs import JobReport
-    from pipelines.options import Existing
 
 
 def existing_choice(overwrite: bool, skip_existing: bool) -> Existing:

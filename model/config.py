@@ -178,7 +178,7 @@ FAST = Config(
     reducer=(32, 32, 24),
     partitioner=(24, 16),
     generator=(48, 48),
-    kernel_sizes=(5, 3, 3, 3, 3, 3),
+    kernel_sizes=(9, 3, 3, 3, 3, 3),
     guide_gates=3,
     divisor_features=4,
 )

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pipelines.progress import ProgressKind
+
+if TYPE_CHECKING:
+    from deep_io.atomic import Existing
 
 ALL_LAYERS = 5
 """Weights hold logits for this many layers; a job keeps between one and all of them."""
 
-Existing = Literal["refuse", "overwrite", "skip"]
 WeightingName = Literal["uniform", "packed", "over"]
 NormalSpace = Literal["auto", "world", "view"]
 DepthKind = Literal["auto", "z", "distance"]

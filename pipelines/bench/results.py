@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import platform
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -13,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from deep_io.cores import usable_cores
 from model.metrics import bootstrap_interval, geometric_mean
 from pipelines import __version__
 from pipelines.bench.methods import OUTSIDE, MethodSpec
@@ -192,7 +192,7 @@ def machine(threads: int) -> dict[str, Any]:
             packages[name] = "not installed"
     return {
         "processor": processor(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": usable_cores(),
         "threads": threads,
         "system": platform.platform(),
         "python": platform.python_version(),

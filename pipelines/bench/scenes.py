@@ -14,8 +14,8 @@ from deep_io.errors import InputError
 from deep_io.path_samples import SampleReader
 from model.metrics import common_scale
 from pipelines.compare import FlatPicture, read_rgb
+from pipelines.scene_names import DEEP, REFERENCE, scene_name
 
-DEEP, REFERENCE = ".deep.exr", ".ref.exr"
 SEED = 20100623
 """Of the order in which samples are left out, the same in every run."""
 
@@ -59,7 +59,7 @@ def find_scenes(folder: Path, match: str = "*") -> list[Scene]:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
-    deep = {path.name.removesuffix(DEEP) for path in folder.glob(f"*{DEEP}")}
+    deep = {scene_name(path) for path in folder.glob(f"*{DEEP}")}
     references = {path.name.removesuffix(REFERENCE) for path in folder.glob(f"*{REFERENCE}")}
     names = [name for name in sorted(deep & references) if fnmatch(name, match)]
     if not names:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
@@ -13,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from deep_io.cores import usable_cores
 from deep_io.errors import InputError, UsageError
 from pipelines.jobs import JobReport, run_frames
 from pipelines.progress import Progress, ProgressKind, make_progress
@@ -89,8 +89,7 @@ def render_and_write(options: RenderOptions, seed: int) -> str:
 
 def threads_per_worker(options: RenderOptions) -> int:
     """The threads asked for, or an equal share of the cores this process may use."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return options.threads or max(1, cores // options.workers)
+    return options.threads or max(1, usable_cores() // options.workers)
 
 
 def render_scenes(options: RenderOptions, progress_kind: ProgressKind = "auto",

@@ -15,6 +15,7 @@ from deep_io import DeepSamples, Window, write_deep
 from deep_io.atomic import atomic_output
 from deep_io.flat import HALF_MAX, write_flat
 from pipelines.rendering.shots import Shot
+from pipelines.scene_names import DEEP, REFERENCE
 
 
 def deep_samples(channels: dict[str, npt.NDArray[np.float32]], size: int) -> DeepSamples:
@@ -28,7 +29,7 @@ def deep_samples(channels: dict[str, npt.NDArray[np.float32]], size: int) -> Dee
 
 def example_files(stem: Path) -> tuple[Path, Path, Path]:
     """The deep file, the reference and the JSON of the example `stem` (a path without extension)."""
-    deep, reference, about = (stem.with_name(stem.name + end) for end in (".deep.exr", ".ref.exr", ".json"))
+    deep, reference, about = (stem.with_name(stem.name + end) for end in (DEEP, REFERENCE, ".json"))
     return deep, reference, about
 
 

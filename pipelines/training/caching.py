@@ -21,6 +21,7 @@ from deep_io.flat import read_flat
 from deep_io.path_samples import PathSamples, SampleReader
 from deep_io.samples import Window
 from model.metrics import common_scale
+from pipelines.scene_names import DEEP, REFERENCE, reference_of, scene_name
 from pipelines.survey import survey
 from pipelines.training.cache import (
     CACHE_VERSION,
@@ -34,7 +35,6 @@ from pipelines.training.cache import (
 )
 from pipelines.training.recipe import SMALLEST_CROP
 
-DEEP_SUFFIX, REFERENCE_SUFFIX = ".deep.exr", ".ref.exr"
 HALF_LIMIT = 60000.0
 
 Report = Callable[[str], None]
@@ -58,19 +58,18 @@ class SceneFiles:
 def scene_files(folder: Path, fewest: int = 1) -> list[SceneFiles]:
     """The scenes of a folder, sorted. Raises InputError: no folder, a file without its partner, fewer than `fewest`."""
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; it must hold NAME{DEEP_SUFFIX} and NAME{REFERENCE_SUFFIX} files")
+        raise InputError(f"{folder}: no such folder; it must hold NAME{DEEP} and NAME{REFERENCE} files")
     files = []
-    for deep in sorted(folder.glob(f"*{DEEP_SUFFIX}")):
-        name = deep.name.removesuffix(DEEP_SUFFIX)
-        reference = folder / f"{name}{REFERENCE_SUFFIX}"
+    for deep in sorted(folder.glob(f"*{DEEP}")):
+        reference = reference_of(deep)
         if not reference.exists():
             raise InputError(f"{deep}: its reference {reference.name} is missing; render it or move the deep file away")
-        files.append(SceneFiles(name, deep, reference))
+        files.append(SceneFiles(scene_name(deep), deep, reference))
     if not files:
-        raise InputError(f"{folder}: no *{DEEP_SUFFIX} files with *{REFERENCE_SUFFIX} references in it")
+        raise InputError(f"{folder}: no *{DEEP} files with *{REFERENCE} references in it")
     if len(files) < fewest:
         raise InputError(f"{folder}: {len(files)} scene{'s'[:len(files) > 1]}; {fewest} or more are needed, "
-                         f"each NAME{DEEP_SUFFIX} with NAME{REFERENCE_SUFFIX}")
+                         f"each NAME{DEEP} with NAME{REFERENCE}")
     return files
 
 

@@ -233,7 +233,7 @@ def test_damage_on_the_library_path_is_an_input_error(tmp_path, compression, til
 
 
 def test_a_folder_is_an_input_error(tmp_path):
-    with pytest.raises(InputError, match="is a folder, not a file"):
+    with pytest.raises(InputError, match="is a folder; name an EXR file"):
         read_deep(tmp_path)
 
 

@@ -1,0 +1,17 @@
+"""What the files of a scene are called: NAME.deep.exr, the samples, and NAME.ref.exr, the reference beside them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+DEEP, REFERENCE = ".deep.exr", ".ref.exr"
+
+
+def scene_name(deep: Path) -> str:
+    """NAME of NAME.deep.exr."""
+    return deep.name.removesuffix(DEEP)
+
+
+def reference_of(deep: Path) -> Path:
+    """NAME.ref.exr beside NAME.deep.exr, whether it exists or not."""
+    return deep.with_name(scene_name(deep) + REFERENCE)
