@@ -131,8 +131,8 @@ def open_input(path: str | os.PathLike[str]) -> BinaryIO:
         if not stat.S_ISREG(os.stat(path).st_mode):
             if os.path.isdir(path):
                 raise InputError(f"{os.fspath(path)}: is a folder; name an EXR file")
-            raise InputError(f"{os.fspath(path)}: is a pipe or a device, but an EXR is read back and forth; write it to "
-                             f"a file first")
+            raise InputError(f"{os.fspath(path)}: is a pipe or a device, but an EXR is read back and forth; write it "
+                             f"to a file first")
         return open(path, "rb")  # The caller closes it.
     except OSError as error:
         raise InputError(f"{os.fspath(path)}: cannot be opened: {error.strerror or error}") from error
