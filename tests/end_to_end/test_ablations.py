@@ -42,7 +42,7 @@ def data(tmp_path: Path) -> Path:
 def test_changes_have_the_budget_and_the_crops_of_the_base(ablations: ModuleType) -> None:
     runs = ablations.runs()
     assert len({one.key for one in runs}) == len(runs)
-    free = ("loss", "finish", "finish_loss", "learning_rate", "partition_entropy", "depth_order")
+    free = ("loss", "finish", "finish_loss", "learning_rate", "muon", "partition_entropy", "depth_order")
     bases = {one.recipe.seed: one for one in runs if one.name == ablations.BASE}
     assert [one.name for one in runs[: len(bases)]] == [ablations.BASE] * len(bases)
     for one in runs[len(bases):]:
