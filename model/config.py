@@ -79,6 +79,7 @@ class Config:
     guide_gates: Literal[1, 3] = 1  # one for all guides of a pixel, or one each for normal, depth and divisor
     demodulation: bool = True  # mix in a path whose kernels average radiance divided by albedo + specular
     divisor_features: int = 0  # learned features of the kernel that filters the divisor, beside the divisor itself
+    filtered_guides: bool = False  # mix guides with themselves behind the divisor's kernel, as much as is predicted
 
     def __post_init__(self) -> None:
         if len(self.unet.encoder) != len(self.unet.decoder):
@@ -95,6 +96,8 @@ class Config:
             raise ValueError("demodulation needs affinity kernels")
         if self.divisor_features and not self.demodulation:
             raise ValueError("without demodulation no divisor is filtered")
+        if self.filtered_guides and not self.demodulation:
+            raise ValueError("without demodulation there is no kernel to filter guides by")
         if self.kernel == "direct" and len(self.kernel_sizes) > 1:
             if self.variant == "sample_splat":
                 raise ValueError("kernels per sample work at the full resolution only")
@@ -105,6 +108,11 @@ class Config:
     def layered(self) -> bool:
         """Whether samples are partitioned over layers."""
         return self.variant in ("layer", "layer_w")
+
+    @property
+    def guide_reach(self) -> int:
+        """Pixels: so far around a source lies what its guides are made of."""
+        return DIVISOR_WINDOW // 2 if self.filtered_guides else 0
 
     @property
     def embedding(self) -> int:

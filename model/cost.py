@@ -154,7 +154,8 @@ def _affinity(config: Config) -> list[Stage]:
     taps = sum(size * size for size in config.kernel_sizes)
     planes = BASIC + 1 + (DIVISOR if config.demodulation else 0)
     distances = DIVISOR + config.divisor_features
-    by_divisor = DIVISOR_WINDOW**2 * (distances + DIVISOR) if config.demodulation else 0
+    smoothed = len(GUIDE_SCALES) if config.filtered_guides else DIVISOR
+    by_divisor = DIVISOR_WINDOW**2 * (distances + smoothed) if config.demodulation else 0
     return [
         Stage("splat", sample_layer=GUIDED_COLUMNS - 2 + config.embedding + 1),
         Stage("generator", parameters + config.partition_logits * hidden, pixel=pixel, layer=layer),

@@ -150,7 +150,7 @@ class Denoiser(nn.Module):
             samples = samples.by_turns()
         if torch.is_grad_enabled() or config.kernel != "affinity" or (wanted is not None and bool(wanted.all())):
             wanted = None
-        seen = None if wanted is None else sources_of(wanted, config.kernel_sizes)
+        seen = None if wanted is None else sources_of(wanted, config.kernel_sizes, config.guide_reach)
         relative = self._surroundings(samples, scale)
         contexts, embedding = self._context(samples, relative, scale, seen, decoded)
         context = _rows(contexts[0], samples.shape)  # (P, C)

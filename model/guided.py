@@ -1,7 +1,8 @@
 """The affinity kernels' stage: what is splatted besides radiance, how kernels are predicted, the demodulated path.
 
 Features for the affinity are predicted per layer and pixel; guides (normal, log depth, divisor) are added to them with
-a learned matrix, so that the kernel is a joint bilateral filter before any training. Glare is a feature of its own.
+a learned matrix, so that the kernel is a joint bilateral filter before any training. Guides of a few samples are noisy
+where motion or defocus mixes surfaces within a pixel, so they may be filtered first. Glare is a feature of its own.
 `affinity.py` has the filter.
 """
 
@@ -19,6 +20,7 @@ from model.samples import Samples, columns
 
 GUIDE_SCALES = (2.0, 2.0, 2.0, 3.0, 1.5, 1.5, 1.5)  # normal, log depth, divisor: the joint bilateral filter at step 0
 GUIDE_WIDTHS = (3, 1, 3)
+DIVISOR = slice(4, 7)  # of the guides
 # What a log unit of glare takes from a source's logit at each coarser level: a cell that holds a corner of a lamp is
 # hardly farther from its dark pixels than one without, and a thousand times brighter.
 GLARE_PER_LEVEL = 0.5
@@ -63,10 +65,13 @@ def demodulated_lights(samples: Samples) -> list[Tensor]:
 
 def generator_sizes(config: Config) -> tuple[int, ...]:
     """What the generator predicts per layer: features, bias and preference per level, gates of guides and glare;
-    with demodulation also the mix, and gate, bias and features of the divisor's kernel."""
+    with demodulation also the mix; gate, bias and features of the divisor's kernel; and how much of each guide is to
+    be its filtered self."""
     levels = len(config.kernel_sizes)
     sizes = (config.affinity_features, levels, levels, config.guide_gates, 1)
-    return (*sizes, 1, 1, 1, config.divisor_features) if config.demodulation else sizes
+    if not config.demodulation:
+        return sizes
+    return (*sizes, 1, 1, 1, config.divisor_features, len(GUIDE_WIDTHS) if config.filtered_guides else 0)
 
 
 def initial_guides(config: Config) -> Tensor:
@@ -105,12 +110,15 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
     share = share_of(log_n, log_w)[:, None]
     own = torch.where(share > 0, share, 1)  # values per unit of the layer's own weight: divide by this
     features, bias, preference, gate, glare_gate, *divided = torch.split(predictions, list(generator_sizes(config)), 1)
-    beyond = glare(planes[:, RADIANCE] / own, scale.exposure) * (0.5 + torch.sigmoid(glare_gate))
     guides = planes[:, GUIDES] / own
+    if config.demodulation:
+        mix, *kernel, amounts = divided
+        guides, factor = _filtered_guides(guides, log_w, kernel, amounts, config, active)
+    beyond = glare(planes[:, RADIANCE] / own, scale.exposure) * (0.5 + torch.sigmoid(glare_gate))
     bias = bias - beyond * GLARE_PER_LEVEL * torch.arange(bias.shape[1], device=bias.device)[:, None, None]
     gates = 2 * torch.sigmoid(gate)
     if config.guide_gates > 1:
-        gates = gates.repeat_interleave(torch.tensor(GUIDE_WIDTHS, device=gates.device), 1)
+        gates = _for_each_guide(gates)
     features = features + torch.einsum("bghw,fg->bfhw", guides * gates, guide_matrix)
     features = torch.cat([features, GLARE_SCALE * beyond], 1)
     reduced_too = [planes[:, REDUCED]] if config.demodulation else []
@@ -119,16 +127,38 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
     if not config.demodulation:
         return out
     plain, others, reduced, extra = torch.split(out, [3, 3, 3, out.shape[1] - 9], 1)
-    mix, divisor_gate, divisor_bias, learned = divided
-    by = guides[:, 4:7]
-    sharp = torch.cat([by * (DIVISOR_GUIDE_SCALE * torch.sigmoid(divisor_gate)), learned], 1)
-    no_preference = torch.zeros_like(divisor_bias)
-    factor = affinity_filter(sharp, divisor_bias, no_preference, log_w, by, (DIVISOR_WINDOW,), active)
-    # no own weight near the target: nothing to multiply by, the plain path stands
-    amount = torch.sigmoid(mix) * (factor.amax(1, keepdim=True) > 0)
+    amount = torch.sigmoid(mix) * _known(factor)  # without a factor the plain path stands
     color = torch.lerp(plain, reduced * factor, amount)
     if not extra.shape[1]:
         return torch.cat([color, others], 1)
     light, data, reduced = torch.split(extra, [lights, extra.shape[1] - 2 * lights, lights], 1)
     light = torch.lerp(light, reduced * factor.repeat(1, lights // 3, 1, 1), amount)
     return torch.cat([color, others, light, data], 1)
+
+
+def _filtered_guides(guides: Tensor, log_w: Tensor, kernel: list[Tensor], amounts: Tensor, config: Config,
+                     active: Tensor | None) -> tuple[Tensor, Tensor]:
+    """The guides (B*L, 7, H, W) mixed with themselves behind the divisor's kernel, and the divisor behind it, 0 where
+    there is no own weight near.
+
+    kernel : gate, bias and learned features; amounts : (B*L, 3 or 0, H, W) logits of how much is mixed in
+    """
+    gate, bias, learned = kernel
+    sharp = torch.cat([guides[:, DIVISOR] * (DIVISOR_GUIDE_SCALE * torch.sigmoid(gate)), learned], 1)
+    window, no_preference = (DIVISOR_WINDOW,), torch.zeros_like(bias)
+    if not config.filtered_guides:
+        return guides, affinity_filter(sharp, bias, no_preference, log_w, guides[:, DIVISOR], window, active)
+    # not of `active` targets alone: their sources need it, too
+    smooth = affinity_filter(sharp, bias, no_preference, log_w, guides, window)
+    factor = smooth[:, DIVISOR]
+    return torch.lerp(guides, smooth, _for_each_guide(torch.sigmoid(amounts)) * _known(factor)), factor
+
+
+def _known(factor: Tensor) -> Tensor:
+    """(B*L, 1, H, W) bool: whether a divisor (B*L, 3, H, W) was filtered from anything."""
+    return factor.amax(1, keepdim=True) > 0
+
+
+def _for_each_guide(values: Tensor) -> Tensor:
+    """(B*L, 3, H, W), one for normal, depth and divisor -> (B*L, 7, H, W), one for each of the guides' columns."""
+    return values.repeat_interleave(torch.tensor(GUIDE_WIDTHS, device=values.device), 1)

@@ -84,7 +84,7 @@ def _output_span(x: int, config: Config, halo: int, decoded: bool) -> Span:
     for level, window in enumerate(config.kernel_sizes):
         size = 2**level
         if config.kernel == "affinity":  # targets keep their full resolution, and so do predictions
-            sources = _pixels(_grow(_cells(target, size), window // 2), size)
+            sources = _grow(_pixels(_grow(_cells(target, size), window // 2), size), config.guide_reach)
             seen.append(context(sources))
         else:
             own = target if level == 0 else _bilinear(target, size)

@@ -15,10 +15,11 @@ def cells_with(wanted: Tensor, size: int) -> Tensor:
     return F.max_pool2d(wanted[:, None].float(), size, ceil_mode=True)[:, 0] > 0
 
 
-def sources_of(wanted: Tensor, windows: Sequence[int]) -> Tensor:
+def sources_of(wanted: Tensor, windows: Sequence[int], around: int = 0) -> Tensor:
     """(B, H, W) bool -> (B, H, W) bool: the pixels that affinity kernels of the wanted targets reach.
 
     windows : odd size of the kernel at each level, in cells of 2**level pixels
+    around : and so many pixels around them
     """
     height, width = wanted.shape[-2:]
     seen = wanted
@@ -26,7 +27,7 @@ def sources_of(wanted: Tensor, windows: Sequence[int]) -> Tensor:
         size = 2**level
         cells = F.max_pool2d(cells_with(wanted, size).float(), window, 1, window // 2) > 0
         seen = seen | cells.repeat_interleave(size, -2).repeat_interleave(size, -1)[..., :height, :width]
-    return seen
+    return F.max_pool2d(seen.float(), 2 * around + 1, 1, around) > 0
 
 
 def box_of(sources: Tensor) -> tuple[slice, slice]:

@@ -41,11 +41,11 @@ SMALL: dict[str, Config] = {
     "sample_splat": _small("sample_splat", (5,)),
     "pixel_gather": _small("pixel_gather", (5,)),
     "optimized": _small("optimized", (3, 3, 3), partition_logits=5),
-    "fast": _small("fast", (3, 3, 3, 3), guide_gates=3, divisor_features=2),
+    "fast": _small("fast", (3, 3, 3, 3), guide_gates=3, divisor_features=2, filtered_guides=True),
     "layer with our encodings": _small("layer", (5,), **_ABLATION),
     "pixel means with affinity": _small("fast", (3, 3), variant="pixel_gather", reducer=(), partition_logits=1,
                                         layers=1, confidence=False, depth_prior=False, demodulation=False,
-                                        divisor_features=0),
+                                        divisor_features=0, filtered_guides=False),
 }
 
 

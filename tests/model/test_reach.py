@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from model.config import FAST, LAYER, UNetConfig
+from model.config import FAST, LAYER, Config, UNetConfig
 from model.denoiser import Denoiser
 from model.features import FrameScale
 from model.networks import UNet
@@ -47,8 +47,8 @@ def test_span_of_a_unet_is_exact(config: UNetConfig) -> None:
             assert unet_span((x, x), config, level) == (int(lights.min()), int(lights.max()))
 
 
-def changed_radius(net: Denoiser, size: int, at: int) -> int:
-    """How far along a row of pixels a disturbance of pixel `at` goes."""
+def changed_radius(net: Denoiser, size: int, at: int, tile: bool = False) -> int:
+    """How far along a row of pixels a disturbance of pixel `at` goes; for a tile, if what the U-Net decodes stays."""
     samples = random_samples(1, (1, 1, size), 2)
     changed = {role: values.clone() for role, values in samples.roles.items()}
     span = slice(2 * at, 2 * at + 2)
@@ -56,22 +56,39 @@ def changed_radius(net: Denoiser, size: int, at: int) -> int:
     changed["depth"][span] *= 3
     changed["albedo"][span] *= 0.5
     with torch.no_grad():
-        first = net(samples, FrameScale(), fill=False)
-        second = net(with_roles(samples, **changed), FrameScale(), fill=False)
+        decoded = net.decoded_context(net.unet_inputs(samples, FrameScale())) if tile else None
+        first = net(samples, FrameScale(), fill=False, decoded=decoded)
+        second = net(with_roles(samples, **changed), FrameScale(), fill=False, decoded=decoded)
     difference = (first.color - second.color).abs().amax((0, 1, 2, 3))
     touched = torch.nonzero(difference > ROUNDING * first.color.max())[:, 0]
     return int((touched - at).abs().max())
 
 
-@pytest.mark.parametrize("variant", sorted(SMALL))
-def test_nothing_farther_than_reach_changes_and_something_nearly_as_far_does(variant: str) -> None:
-    net = random_network(SMALL[variant], 2)
+def wide_network(config: Config) -> Denoiser:
+    """Whose kernels look as far as they can."""
+    net = random_network(config, 2)
     with torch.no_grad():
         for parameter in net.parameters():  # small weights: kernels stay wide, so every tap counts
             parameter.mul_(0.3)
         for parameter in net.unet.parameters():  # positive ones: nothing cancels
             parameter.abs_()
+    return net
+
+
+@pytest.mark.parametrize("variant", sorted(SMALL))
+def test_nothing_farther_than_reach_changes_and_something_nearly_as_far_does(variant: str) -> None:
+    net = wide_network(SMALL[variant])
     centre = (net.reach // net.stride + 2) * net.stride
     radii = [changed_radius(net, 2 * centre, centre + k) for k in range(net.stride)]
     assert max(radii) <= net.reach
     assert max(radii) >= 0.75 * net.reach
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+def test_the_same_for_a_tile_of_a_decoded_picture(filtered: bool) -> None:
+    net = wide_network(replace(SMALL["fast"], filtered_guides=filtered))
+    assert net.tile_reach is not None
+    centre = (net.tile_reach // net.stride + 2) * net.stride
+    radii = [changed_radius(net, 2 * centre, centre + k, tile=True) for k in range(net.stride)]
+    assert max(radii) <= net.tile_reach
+    assert max(radii) >= 0.75 * net.tile_reach
