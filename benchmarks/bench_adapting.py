@@ -1,13 +1,16 @@
 #!/usr/bin/env python3
 """What modelling only what a scene needs saves, and what it costs: one row for each saving.
 
-    python benchmarks/bench_adapting.py FOLDER... [--model fast] [--repeats 3] [--json docs/results/adapting.json]
+    python benchmarks/bench_adapting.py FOLDER... [--model fast] [--repeats 3] [--contexts FULL HALF]
+                                        [--json docs/results/adapting.json]
 
 A FOLDER holds NAME.deep.exr with NAME.ref.exr. docs/tables.py makes the table of docs/adapting.md of the JSON. Each
 saving is measured on the scenes where the survey chooses it and, forced, on those where it does not. Scenes that need
 less are also made of the others: crops in which depth does not mix, and frames of several tiles whose upper half is
-plain sky or holds no samples. Time is the CPU time of the network, the runs with and without a saving taking turns,
-medians; error is relMSE, its ratio averaged geometrically.
+plain sky or holds no samples. What a context at half resolution saves no single network can tell: FULL and HALF are the
+weights of two that differ in that alone, such as full-resolution.1 and base.1 of ablations.py. Time is the CPU time of
+the network, the runs with and without a saving taking turns, medians; error is relMSE, its ratio averaged
+geometrically.
 """
 
 from __future__ import annotations
@@ -28,6 +31,8 @@ from deep_io.errors import LbmcError
 from deep_io.header import Header
 from deep_io.path_samples import PathSamples
 from deep_io.samples import Window
+from model import zoo
+from model.denoiser import Denoiser
 from model.features import FrameScale
 from model.metrics import geometric_mean, score
 from pipelines.cells import Cells
@@ -78,13 +83,18 @@ class InMemory:
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """What one run is told: layers (None: the network's), roles held or dropped, cells that pass, precision."""
+    """What one run is told: network (None: the one that is measured), layers (None: the network's), roles held or
+    dropped, cells that pass, precision."""
 
+    net: Denoiser | None = None
     layers: int | None = None
     held: frozenset[str] = frozenset()
     dropped: frozenset[str] = frozenset()
     cells: Cells | None = None
     dtype: torch.dtype | None = None
+
+
+PLAIN = Choice()
 
 
 @dataclasses.dataclass
@@ -121,7 +131,8 @@ class Bench:
 
     def run(self, scene: Scene, choice: Choice) -> tuple[np.ndarray, float]:
         """The beauty (H, W, 3), and CPU seconds."""
-        net, height = self.job.net.set_product_dtype(choice.dtype), scene.samples.counts.shape[0]
+        net, height = choice.net or self.job.net, scene.samples.counts.shape[0]
+        net.set_product_dtype(choice.dtype)
         roles = tuple(r for r in net.config.roles if r in scene.samples.roles and r not in choice.held | choice.dropped)
         reader = InMemory(scene)
         begun = time.process_time()
@@ -130,11 +141,12 @@ class Bench:
                                held=choice.held & scene.samples.roles.keys(), cells=choice.cells)
         return layers.beauty(), time.process_time() - begun
 
-    def measure(self, row: Row, scene: Scene, choice: Choice, kept: np.ndarray | None = None) -> None:
+    def measure(self, row: Row, scene: Scene, choice: Choice, kept: np.ndarray | None = None,
+                base: Choice = PLAIN) -> None:
         """Adds a scene to a row; `kept` (H, W): pixels whose largest relative change is looked at."""
         runs: list[tuple[float, float]] = []
         for _ in range(self.repeats):
-            (plain, before), (saving, after) = self.run(scene, Choice()), self.run(scene, choice)
+            (plain, before), (saving, after) = self.run(scene, base), self.run(scene, choice)
             runs.append((before, after))
         row.before.append(median(before for before, _ in runs))
         row.after.append(median(after for _, after in runs))
@@ -189,8 +201,8 @@ def halves(scene: Scene) -> tuple[Scene, Scene, Scene]:
     return (Scene.of(scene.name, whole, None), Scene.of(scene.name, sky, None), Scene.of(scene.name, empty, None))
 
 
-def table(bench: Bench, scenes: list[Scene], note: Callable[[str], None]) -> list[Row]:
-    """Every saving on every scene."""
+def table(bench: Bench, scenes: list[Scene], contexts: tuple[Denoiser, ...], note: Callable[[str], None]) -> list[Row]:
+    """Every saving on every scene; `contexts` are of full and half resolution, or none."""
     rows: dict[tuple[str, str], Row] = {}
 
     def row(label: str, where: str) -> Row:
@@ -216,15 +228,18 @@ def table(bench: Bench, scenes: list[Scene], note: Callable[[str], None]) -> lis
         where = "chosen" if passes else "nothing passes"
         bench.measure(row("cells pass", where), scene, Choice(cells=cells), ~cells.mask)
         bench.measure(row("bf16 products", "all"), scene, Choice(dtype=torch.bfloat16))
+        if contexts:
+            full, half = (Choice(net) for net in contexts)
+            bench.measure(row("context at half resolution", "all, reduced networks"), scene, half, base=full)
     for scene in scenes[:: max(len(scenes) // 4, 1)]:
-        full, *less = halves(scene)
+        whole_frame, *less = halves(scene)
         for half, name in zip(less, ("plain sky above", "no samples above"), strict=True):
             note(f"{scene.name}, {name}")
             cells = half.seen.cells
             bench.measure(row("cells pass", name), half, Choice(cells=cells), ~cells.mask)
             whole, passed = row("cells pass", f"{name}, against a full frame"), []
             for _ in range(bench.repeats):
-                whole_time, part_time = bench.run(full, Choice())[1], bench.run(half, Choice(cells=cells))[1]
+                whole_time, part_time = bench.run(whole_frame, PLAIN)[1], bench.run(half, Choice(cells=cells))[1]
                 passed.append((whole_time, part_time))
             whole.before.append(median(a for a, _ in passed))
             whole.after.append(median(b for _, b in passed))
@@ -236,6 +251,7 @@ def main() -> None:
     parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
     parser.add_argument("--model", default="fast")
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--contexts", nargs=2, default=(), metavar=("FULL", "HALF"))
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     bench, scenes = Bench(options.model, options.repeats), []
@@ -244,7 +260,8 @@ def main() -> None:
         if not paths:
             sys.exit(f"ERROR: {folder}: no NAME.deep.exr with a NAME.ref.exr beside it")
         scenes += [bench.load(path) for path in paths]
-    rows = table(bench, scenes, lambda text: print(text, file=sys.stderr))
+    contexts = tuple(zoo.find(name).load().eval() for name in options.contexts)
+    rows = table(bench, scenes, contexts, lambda text: print(text, file=sys.stderr))
     print("| saving | scenes | number | CPU s without | saved | relMSE | largest change outside |\n" + "|---" * 7 + "|")
     print("\n".join(row.line() for row in rows))
     if options.json:
