@@ -24,6 +24,7 @@ from deep_io.roles import MISS_DEPTH, ROLES, RoleMap
 from deep_io.samples import DeepSamples, Window
 from deep_io.weighting import (
     ATTRIBUTE,
+    RADIANCE_LAYERS,
     WEIGHTINGS,
     Weighted,
     decode_packed,
@@ -109,7 +110,8 @@ def interpretation(header: Header, path: str, overrides: Mapping[str, str] | Non
     if header.get(DEPTH_ATTRIBUTE) == "none":
         overrides = {"depth": "none", **(overrides or {})}  # Z orders the samples and measures nothing
     mapping = map_roles(header.channel_names, overrides, attributes=header.attributes,
-                        dtypes={channel.name: channel.dtype for channel in header.channels}, source=path)
+                        dtypes={channel.name: channel.dtype for channel in header.channels}, source=path,
+                        lights=header.get(RADIANCE_LAYERS) or ())
     stated = header.get(ATTRIBUTE)
     chosen = weighting or stated
     if chosen is not None and chosen not in WEIGHTINGS:

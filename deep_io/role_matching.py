@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +22,7 @@ def renderer_of(attributes: Iterable[str]) -> str:
 
 def map_roles(channel_names: Iterable[str], overrides: Mapping[str, str] | None = None, *,
               attributes: Iterable[str] = (), dtypes: Mapping[str, np.dtype[np.generic]] | None = None,
-              source: str = "the file") -> RoleMap:
+              source: str = "the file", lights: Collection[str] = ()) -> RoleMap:
     """Find the roles among the channels of a file.
 
     Parameters
@@ -31,6 +31,7 @@ def map_roles(channel_names: Iterable[str], overrides: Mapping[str, str] | None 
         attributes     names of the header's attributes: they show the renderer, whose rows then win
         dtypes         the channels' types, to refuse radiance stored as uint
         source         the file's name for messages
+        lights         layers that are known for parts of the radiance: they play no role but by an override
     Raises InputError when there is no R, G, B, when two layers match one role, when radiance is uint or when an
     override names a layer that is absent or too narrow; UsageError when it names an unknown role.
     """
@@ -39,7 +40,7 @@ def map_roles(channel_names: Iterable[str], overrides: Mapping[str, str] | None 
     renderer = renderer_of(attributes)
     overrides = dict(overrides or {})
     found = _by_options(overrides, layers, renderer, source)
-    claims, remarks = _by_names(overrides, found, layers, renderer)
+    claims, remarks = _by_names(overrides, found, layers, renderer, lights)
     for role, candidates in claims.items():
         if len(candidates) > 1:
             both = " and ".join(repr(claim.layer or "RGB") for claim in candidates)
@@ -68,16 +69,16 @@ def _by_options(overrides: Mapping[str, str], layers: Layers, renderer: str, sou
     return found
 
 
-def _by_names(overrides: Mapping[str, str], chosen: Mapping[str, RoleSource], layers: Layers, renderer: str
-              ) -> tuple[dict[str, list[RoleSource]], list[str]]:
+def _by_names(overrides: Mapping[str, str], chosen: Mapping[str, RoleSource], layers: Layers, renderer: str,
+              lights: Collection[str]) -> tuple[dict[str, list[RoleSource]], list[str]]:
     """The layers that match each role by their names, and remarks on those that nearly do."""
     claims: dict[str, list[RoleSource]] = {}
     remarks: list[str] = []
     # One channel picked out of a wider layer, such as the A of RGBA, leaves the layer to its own role.
     taken = {claim.layer for claim in chosen.values() if len(claim.channels) > 1 or len(layers[claim.layer]) == 1}
     for layer, components in layers.items():
-        if layer in taken:
-            continue  # named by an option: not up for matching, nothing to remark
+        if layer in taken or layer in lights:
+            continue  # named by an option or by the header: not up for matching, nothing to remark
         if reason := _reason_against(layer, renderer):
             remarks.append(f"{layer} is not used: {reason}")
             continue

@@ -21,7 +21,7 @@ PathLike = str | os.PathLike[str]
 
 # What stands for the frame number in a file's name. An @ inside a word, as in user@host.exr, does not.
 _NUMBER = re.compile(r"#+|@+(?![A-Za-z0-9@])|(?:%0?(?P<printf>\d*)d|\$F(?P<houdini>\d*))(?![A-Za-z])")
-_RANGE_BEFORE = re.compile(r"(?:^|(?<=[^A-Za-z0-9,:-]))(?P<range>\d+(?:[-\d,x:]*\d)?)$")
+_RANGE_BEFORE = re.compile(r"(?:^|(?<=[^A-Za-z0-9,:-]))(?P<range>\d+[-,][-\d,x:]*\d)$")
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,11 @@ class _Pattern:
 def has_pattern(path: PathLike) -> bool:
     """Whether the name holds a frame pattern, whatever exists on disk."""
     return bool(_numbers(Path(path).name))
+
+
+def has_range(pattern: PathLike) -> bool:
+    """Whether a pattern names its frames itself, as in shot.1001-1010####.exr. Raises UsageError for one of none."""
+    return bool(_parse(pattern).frames)
 
 
 def is_sequence(path: PathLike) -> bool:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from deep_io.csr import Counts, Index, by_rank, depth_order, strictly_increasing
 
 ATTRIBUTE = "lbmc:weighting"
+RADIANCE_LAYERS = "lbmc:radianceLayers"
 WEIGHTINGS = ("uniform", "packed", "over")
 
 Floats: TypeAlias = NDArray[np.floating[Any]]

@@ -21,6 +21,7 @@ from deep_io.header import Header, channels_of
 from deep_io.role_matching import map_roles
 from deep_io.roles import RoleMap
 from deep_io.samples import DeepSamples, Window
+from pipelines.channel_names import id_channels, is_colored, layers_of
 
 PathLike = str | os.PathLike[str]
 Pixels = NDArray[np.generic]
@@ -61,9 +62,9 @@ def read_renders(sources: Sequence[PathLike], overrides: Mapping[str, str] | Non
     """Read renders of the same frame made with different seeds.
 
     overrides  role -> layer, as for a deep file
-    layers     further layers to carry along, by name
-    Raises InputError when a file is unreadable or deep, has no R, G, B or two layers for one role, when windows, pixel
-    aspects or channels differ between files, and when two files hold the same picture.
+    layers     further layers of light to carry along, by name
+    Raises InputError when a file is unreadable or deep, has no R, G, B or two layers for one role, or lacks a layer to
+    carry along, when windows, pixel aspects or channels differ between files, and when two files hold the same picture.
     """
     names = [os.fspath(source) for source in sources]
     first: Header | None = None
@@ -76,7 +77,7 @@ def read_renders(sources: Sequence[PathLike], overrides: Mapping[str, str] | Non
             first = merged.header
             mapping = map_roles(merged.channels, overrides, attributes=first.attributes,
                                 dtypes={key: pixels.dtype for key, pixels in merged.channels.items()}, source=name)
-            wanted = [*mapping.channels, *_layer_channels(merged.channels, layers, name)]
+            wanted = [*mapping.channels, *_layer_channels(merged.header, layers, mapping, name)]
         else:
             _same_layout(first, names[0], merged.header, name)
         _refuse_same_picture(merged.channels, mapping, name, pictures)
@@ -90,7 +91,7 @@ def merge_parts(parts: Sequence[FlatImage], path: str) -> FlatImage:
     """The channels of all parts under unique names: the beauty's bare R, G, B, A stay, others get their part's name.
 
     Blender repeats the part's name in its channels, which then stay as they are. Attributes are the first part's and
-    what the others add. Raises InputError when the parts' windows differ.
+    what the others add. Raises InputError when the parts' windows differ, and when two channels end up as one.
     """
     if len(parts) == 1:
         return parts[0]
@@ -105,6 +106,9 @@ def merge_parts(parts: Sequence[FlatImage], path: str) -> FlatImage:
         for name, pixels in part.channels.items():
             own = part is beauty or name.startswith(f"{part.header.name}.")
             full = name if own and name not in channels else f"{part.header.name}.{name}"
+            if full in channels:
+                raise InputError(f"{path}: part {part.header.name!r} and another one both hold the channel {full!r}; "
+                                 f"rename one of the parts")
             channels[full] = pixels
     first = parts[0].header
     header = Header(channels_of({name: pixels.dtype for name, pixels in channels.items()}), first.data_window,
@@ -113,24 +117,42 @@ def merge_parts(parts: Sequence[FlatImage], path: str) -> FlatImage:
 
 
 def _beauty_part(parts: Sequence[FlatImage]) -> FlatImage | None:
-    """The first part with bare R, G, B whose name is not that of another role's layer, such as `albedo`."""
-    for part in parts:
-        if {"R", "G", "B"} <= set(part.channels):
-            name = part.header.name
-            roles = map_roles(["R", "G", "B", *(f"{name}.{letter}" for letter in "RGB")], {"radiance": "RGB"})
-            if set(roles.roles) == {"radiance"}:
-                return part
+    """The part with bare R, G, B that is the beauty by its name, such as `rgba`; else the only one whose name is not
+    that of another role's layer, such as `albedo`, or of these the only one with A, or the only one without a name."""
+    colored = [part for part in parts if {"R", "G", "B"} <= set(part.channels)]
+    roles = {part.header.name: _role_of(part.header.name) for part in colored}
+    named = [part for part in colored if part.header.name and roles[part.header.name] == "radiance"]
+    others = [part for part in colored if roles[part.header.name] in ("", "radiance")]
+    for candidates in (named, others, [part for part in others if "A" in part.channels],
+                       [part for part in others if not part.header.name]):
+        if len(candidates) == 1:
+            return candidates[0]
     return None
 
 
-def _layer_channels(channels: Iterable[str], layers: Sequence[str], path: str) -> list[str]:
-    found = []
+def _role_of(layer: str) -> str:
+    """The role that a layer of three colours plays by its name, "" for none."""
+    beside = map_roles(["R", "G", "B", *(f"{layer}.{letter}" for letter in "RGB")], {"radiance": "RGB"})
+    others = [role for role in beside.roles if role != "radiance"]
+    if others or not layer:
+        return others[0] if others else "radiance"
+    try:
+        alone = map_roles([f"{layer}.{letter}" for letter in "RGB"])
+    except InputError:
+        return ""
+    return "radiance" if "radiance" in alone.roles else ""
+
+
+def _layer_channels(header: Header, layers: Sequence[str], mapping: RoleMap, path: str) -> list[str]:
+    there, ids = layers_of(header.channel_names), id_channels(header)
+    lights = {layer: names for layer, names in there.items()
+              if is_colored(names) and not {*ids, *mapping.channels} & set(names)}
     for layer in layers:
-        names = [name for name in channels if name.rpartition(".")[0] == layer]
-        if not names:
-            raise InputError(f"{path}: has no layer {layer!r} to carry along")
-        found += names
-    return found
+        if layer not in lights:
+            why = f"{' '.join(there[layer])} are no part of the light" if layer in there else "there is no such layer"
+            raise InputError(f"{path}: --layer {layer}: {why}; layers with R, G, B that play no role: "
+                             f"{', '.join(lights) or 'none'}")
+    return [name for layer in layers for name in lights[layer]]
 
 
 def _same_layout(first: Header, first_name: str, other: Header, name: str) -> None:

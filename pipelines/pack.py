@@ -23,11 +23,20 @@ from deep_io.decoding import LARGEST_RADIANCE, Interpretation, path_samples, rad
 from deep_io.deep_writer import DeepWriter
 from deep_io.errors import InputError, UsageError
 from deep_io.flat import HALF_MAX, kept_attributes, to_half
-from deep_io.header import Header, channels_of
+from deep_io.header import Header, channels_of, read_headers
 from deep_io.roles import MISS_DEPTH, ROLES, RoleMap
 from deep_io.samples import DeepSamples
-from deep_io.sequences import expand, frame_path, has_pattern, is_sequence, parse_frames, require_exr, substitute
-from deep_io.weighting import ATTRIBUTE, Packed, encode_packed
+from deep_io.sequences import (
+    expand,
+    frame_path,
+    has_pattern,
+    has_range,
+    is_sequence,
+    parse_frames,
+    require_exr,
+    substitute,
+)
+from deep_io.weighting import ATTRIBUTE, RADIANCE_LAYERS, Packed, encode_packed
 from pipelines import __version__
 from pipelines.flat_renders import RenderStack, read_renders
 from pipelines.jobs import FrameSkippedError, JobReport, run_frames
@@ -39,8 +48,10 @@ SEED_TOKEN = "@SEED@"
 # Beyond this many samples L / n in half loses its digits to underflow, so radiance is written as float.
 MOST_IN_HALF = 16
 _BLOCK_SAMPLES = 1 << 20
+LIGHT = "_light"  # ends the name of a layer of light that is otherwise a role's
 OVERFLOW = "radiance overflow"  # among the repairs: radiance beyond half, stored as Inf
 _REPAIRED = {
+    "depth": "whose depth is negative, not finite or too large, stored as unknown",
     "radiance": f"left out: their radiance is not finite, or beyond {LARGEST_RADIANCE:g}",
     OVERFLOW: f"of radiance stored as Inf, which in half is an overflow: read as {HALF_MAX:g}",
 }
@@ -51,7 +62,7 @@ class PackOptions:
     """How renders become a deep sample file.
 
     overrides    role -> layer, as for `lbmc denoise`
-    layers       further radiance-like layers (light groups, lobes) to carry along, encoded as radiance is
+    layers       further layers of light (light groups, lobes) to carry along, encoded as radiance is
     normals, depth, camera   see deep_io.conventions.resolve; what cannot be converted is kept and said
     pixel_type   "half" or "float" of the channels; depth and alpha are float always, radiance above 16 samples too
     compression  none, rle or zips
@@ -105,7 +116,7 @@ def plan(sources: Sequence[PathLike], target: PathLike, seeds: str | None = None
 
     sources  files of one frame; or patterns `shot.s1.####.exr`, one for each seed, with a pattern as target; or, with
              `seeds` ("1-8"), one name that holds @SEED@
-    frames   range of a sequence; by default those of the first pattern on disk
+    frames   range of a sequence; by default all that are on disk, of any seed
     Raises InputError for files or frames that are missing and when only one of sources and target is a sequence,
     UsageError for options that contradict.
     """
@@ -114,7 +125,9 @@ def plan(sources: Sequence[PathLike], target: PathLike, seeds: str | None = None
     if seeds is not None:
         if len(patterns) != 1:
             raise UsageError(f"--seeds {seeds}: takes one name with {SEED_TOKEN}, not {len(patterns)} names")
-        patterns = substitute(patterns[0], SEED_TOKEN, parse_frames(seeds, f"--seeds {seeds}"))
+        width = len(seeds) - len(seeds.lstrip("0123456789")) if seeds.startswith("0") else 1  # 01-12: 01, 02, ...
+        numbers = [str(seed).zfill(width) for seed in parse_frames(seeds, f"--seeds {seeds}")]
+        patterns = substitute(patterns[0], SEED_TOKEN, numbers)
     if not patterns:
         raise UsageError("pack needs at least one render")
     for pattern in patterns:
@@ -133,9 +146,10 @@ def plan(sources: Sequence[PathLike], target: PathLike, seeds: str | None = None
     if not has_pattern(target):
         raise InputError(f"{os.fspath(target)}: the renders are sequences ({many[0]}) but OUT is a single file; write "
                          f"the frame number into OUT as well, or name the files of one frame")
-    first = expand(patterns[0], frames)
-    span = ",".join(str(frame.number) for frame in first)
-    by_seed = [first, *(expand(pattern, span) for pattern in patterns[1:])]
+    if frames is None:  # those of all seeds, so that one which lacks a frame is found out
+        naming = [pattern for pattern in patterns if has_range(pattern)] or patterns
+        frames = ",".join(map(str, sorted({frame.number or 0 for pattern in naming for frame in expand(pattern)})))
+    by_seed = [expand(pattern, frames) for pattern in patterns]
     return [PackJob(of_frame[0].number, tuple(frame.source for frame in of_frame),
                     frame_path(target, int(of_frame[0].number or 0))) for of_frame in zip(*by_seed, strict=True)]
 
@@ -146,7 +160,7 @@ def pack_frames(jobs: Sequence[PackJob], options: PackOptions | None = None, pro
     options = options or PackOptions()
     every_source = Inputs(source for job in jobs for source in job.sources)
     for job in jobs:
-        output_action(job.target, every_source, options.existing)
+        _writes(job.target, every_source, options.existing)
 
     told: set[str] = set()
 
@@ -174,7 +188,7 @@ def pack(sources: Sequence[PathLike], target: PathLike, options: PackOptions | N
     options = options or PackOptions()
     if options.pixel_type not in ("half", "float"):
         raise UsageError(f"--pixel-type {options.pixel_type}: must be half or float")
-    if not output_action(target, sources, options.existing):
+    if not _writes(target, sources, options.existing):
         return None
     stack = read_renders(sources, options.overrides, options.layers)
     how = _Encoding(stack, options)
@@ -190,31 +204,57 @@ def pack(sources: Sequence[PathLike], target: PathLike, options: PackOptions | N
     return PackReport(Path(target), len(stack.frames), stack.mapping, tuple(how.notes), repairs)
 
 
+def _writes(target: PathLike, sources: Sequence[PathLike] | Inputs, existing: Existing) -> bool:
+    """Whether a target is to be written, see `output_action`. A flat EXR is likelier the last render of a command
+    without OUT than what was packed before, so it is never replaced."""
+    writes = output_action(target, sources, existing)
+    if writes and os.path.exists(target) and _is_flat(target):
+        raise UsageError(f"{os.fspath(target)}: is a flat EXR, which pack does not replace; name OUT last, or remove "
+                         f"it first")
+    return writes
+
+
+def _is_flat(path: PathLike) -> bool:
+    try:
+        return not any(header.is_deep for header in read_headers(path))
+    except InputError:
+        return False
+
+
 class _Encoding:
     """How one stack is written: the conversions, the types of the channels, the header."""
 
     def __init__(self, stack: RenderStack, options: PackOptions) -> None:
         mapping, path = stack.mapping, stack.sources[0]
         self.mapping = mapping
-        self.layer_channels = [name for name in stack.frames[0] if name not in mapping.channels]
         self.notes = [f"assumed: {len(stack.frames)} renders of one sample per pixel each, pixel filter box"]
+        self.light_channels = self._light_channels([name for name in stack.frames[0] if name not in mapping.channels])
         attributes: dict[str, object] = {ATTRIBUTE: "packed", "lbmc:version": __version__}
         camera = parse_camera(options.camera) if isinstance(options.camera, str) else options.camera
         given = resolve(stack.header, mapping, path, options.normals, options.depth, camera, strict=False)
         self.conventions = self._convertible(given, attributes)
-        if self.layer_channels:
-            attributes["lbmc:radianceLayers"] = sorted({name.rpartition(".")[0] for name in self.layer_channels})
+        if self.light_channels:
+            attributes[RADIANCE_LAYERS] = sorted({name.rpartition(".")[0] for name in self.light_channels.values()})
         # Coverage is left out: alpha is stored as rendered, also on an opaque sky that no ray hit.
         features = RoleMap({role: source for role, source in mapping.sources.items() if role != "coverage"})
         self.how = Interpretation(stack.header, features, "uniform", True, self.conventions, path)
         self.radiance_type = self._radiance_type(stack, options)
         feature_type = np.float16 if options.pixel_type == "half" else np.float32
         types: dict[str, Any] = {name: feature_type for role in mapping.roles for name in ROLES[role].channels}
-        types |= dict.fromkeys((*ROLES["radiance"].channels, *self.layer_channels), self.radiance_type)
+        types |= dict.fromkeys((*ROLES["radiance"].channels, *self.light_channels.values()), self.radiance_type)
         self.types = types | {"A": np.float32, "Z": np.float32}
         kept = replace(stack.header, attributes=kept_attributes(stack.header), structure={}, name="",
                        type="deepscanline", line_order="increasing", channels=channels_of(self.types))
         self.header: Header = kept.with_attributes(attributes)
+
+    def _light_channels(self, names: Sequence[str]) -> dict[str, str]:
+        """What the channels of light to carry along are called in the file: as in the renders, if no role is."""
+        roles = {name for role in self.mapping.roles for name in ROLES[role].channels}
+        taken = {name.rpartition(".")[0] for name in names if name in roles}
+        self.notes += [f"the layer {layer} is written as {layer}{LIGHT}: {layer} is a role of the file"
+                       for layer in sorted(taken)]
+        return {name: f"{layer}{LIGHT if layer in taken else ''}.{suffix}"
+                for name in names for layer, _, suffix in [name.rpartition(".")]}
 
     def _convertible(self, given: Conventions, attributes: dict[str, object]) -> Conventions:
         """What can be converted now; the rest is stored as it is, and the header and the notes say so."""
@@ -237,7 +277,7 @@ class _Encoding:
         if len(stack.frames) > MOST_IN_HALF:
             self.notes.append(f"radiance is float: half underflows with more than {MOST_IN_HALF} samples")
             return np.float32
-        colours = [*self.mapping["radiance"].channels, *self.layer_channels]
+        colours = [*self.mapping["radiance"].channels, *self.light_channels]
         if stack.largest(colours) > HALF_MAX:
             self.notes.append("radiance is float: it goes beyond the range of half")
             return np.float32
@@ -264,9 +304,9 @@ class _Encoding:
             if role != "depth":
                 for index, name in enumerate(ROLES[role].channels):
                     channels[name] = self._stored(name, values[:, index], packed, role == "radiance")
-        for name in self.layer_channels:
-            values, sound = radiance_values(block.channels[name])
-            repairs[name] += int(np.count_nonzero(~sound))
+        for source, name in self.light_channels.items():
+            values, sound = radiance_values(block.channels[source])
+            repairs[source] += int(np.count_nonzero(~sound))
             channels[name] = self._stored(name, np.where(sound, values, 0), packed, True)
         return DeepSamples(block.counts, {name: channels[name] for name in self.types}, block.window)
 

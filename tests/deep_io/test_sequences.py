@@ -76,7 +76,8 @@ def test_ranges_that_cannot_be_read_are_usage_errors(shot, text):
         expand(shot / "shot.####.exr", text)
 
 
-@pytest.mark.parametrize("name", ["2024-11-23-####.exr", "shot_1-2-####.exr", "1001,####.exr", "shot.10x####.exr"])
+@pytest.mark.parametrize("name", ["2024-11-23-####.exr", "shot_1-2-####.exr", "1001,####.exr", "shot.10x####.exr",
+                                  "comp_2####.exr", "v3.####.exr"])
 def test_what_ends_in_no_digit_is_a_name_and_no_range(name, tmp_path):
     (tmp_path / name.replace("####", "0001")).touch()
     assert [frame.number for frame in expand(tmp_path / name)] == [1]

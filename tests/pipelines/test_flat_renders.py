@@ -50,3 +50,30 @@ def test_parts_with_different_windows_are_an_error():
                       Header(channels_of({"Z": np.float16}), Window(1, 0, 3, 1), Window(0, 0, 2, 1), "depth"))
     with pytest.raises(InputError, match=r"x\.exr: the windows of parts 'main' and 'depth' differ"):
         merge_parts([part("main", "R G B"), other], "x.exr")
+
+
+@pytest.mark.parametrize(("names", "beauty"), [
+    (("diffuse", "rgba"), "rgba"),
+    (("diffuse", "beauty", "glossy"), "beauty"),
+    (("albedo", "main"), "main"),
+    (("primary", "albedo", "diffuse_albedo"), "primary"),
+])
+def test_the_beauty_is_the_part_that_its_name_says_or_that_is_left(names: tuple[str, ...], beauty: str) -> None:
+    merged = merge_parts([part(name, "R G B A", 10 * number) for number, name in enumerate(names)], "x.exr")
+    assert merged.channels["R"][0, 0] == 10 * names.index(beauty)
+
+
+def test_of_parts_that_all_could_be_the_beauty_none_is_taken(tmp_path) -> None:
+    for seed in range(2):
+        write_flat_parts(tmp_path / f"{seed}.exr", [part("diffuse", "R G B A", seed), part("glossy", "R G B A"),
+                                                    part("primary", "R G B A", 5 + seed)])
+    files = [tmp_path / "0.exr", tmp_path / "1.exr"]
+    with pytest.raises(InputError, match=r"--map radiance=LAYER \(there are diffuse, glossy, primary\)"):
+        read_renders(files)
+    stack = read_renders(files, {"radiance": "primary"})
+    assert stack.block(0, 1).channels["primary.R"].tolist() == [5, 6] * 3
+
+
+def test_two_channels_that_would_get_one_name_are_an_error() -> None:
+    with pytest.raises(InputError, match=r"x\.exr: part 'albedo' and another one both hold the channel 'albedo\.R'"):
+        merge_parts([part("rgba", "R G B A albedo.R albedo.G albedo.B"), part("albedo", "R G B")], "x.exr")

@@ -306,8 +306,45 @@ def test_further_layers_flatten_like_radiance(tmp_path):
     out = tmp_path / "deep.exr"
     pack(write_renders(tmp_path, pictures), out, PackOptions(layers=("key",)))
     np.testing.assert_allclose(flatten(out)["key.R"], mean(pictures, "key.R"), rtol=HALF, atol=1e-5)
-    with pytest.raises(InputError, match="no layer 'fill'"):
+    with pytest.raises(InputError, match="--layer fill: there is no such layer; .*: key"):
         pack(write_renders(tmp_path, pictures), tmp_path / "other.exr", PackOptions(layers=("fill",)))
+
+
+@pytest.mark.parametrize("layer", ["P", "id", "CryptoObject00", "albedo"])
+def test_what_is_no_light_is_no_layer_to_carry_along(tmp_path, layer):
+    names = {"P": "XYZ", "CryptoObject00": "RGBA", "albedo": "RGB"}
+    pictures = [render(seed) for seed in range(2)]
+    for picture in pictures:
+        picture |= {f"{name}.{suffix}": picture["R"].astype(np.float32) for name, of in names.items() for suffix in of}
+        picture["id"] = np.ones((HEIGHT, WIDTH), np.uint32)
+    whole = Window(0, 0, WIDTH - 1, HEIGHT - 1)
+    like = Header(channels_of({"R": np.float16}), whole, whole)
+    like = like.with_attributes({"cryptomatte/1/name": "CryptoObject"})
+    with pytest.raises(InputError, match=f"--layer {layer}: .* no role: none"):
+        pack(write_renders(tmp_path, pictures, like), tmp_path / "deep.exr", PackOptions(layers=(layer,)))
+    assert not (tmp_path / "deep.exr").exists()
+
+
+@pytest.mark.parametrize("albedo", [False, True])
+def test_a_layer_of_light_with_the_name_of_a_role_is_not_that_role(tmp_path, albedo):
+    """Arnold's lobe `specular` beside its `specular_albedo`, or alone."""
+    pictures = [render(seed) for seed in range(4)]
+    for seed, picture in enumerate(pictures):
+        picture |= {f"specular.{name}": render(seed + 50)[name] for name in "RGB"}
+        if albedo:
+            picture |= {f"specular_albedo.{name}": np.full((HEIGHT, WIDTH), 0.25, np.float16) for name in "RGB"}
+    layer, out = "specular_light" if albedo else "specular", tmp_path / "deep.exr"
+    whole = Window(0, 0, WIDTH - 1, HEIGHT - 1)
+    like = Header(channels_of({"R": np.float16}), whole, whole)
+    pack(write_renders(tmp_path, pictures, like.with_attributes({"arnold/version": "7"})), out,
+         PackOptions(layers=("specular",)))
+    np.testing.assert_allclose(flatten(out)[f"{layer}.G"], mean(pictures, "specular.G"), rtol=HALF, atol=1e-5)
+    samples = read(out)
+    assert ("specular" in samples.roles) == albedo
+    if albedo:
+        assert set(np.unique(samples.roles["specular"][samples.coverage > 0])) == {0.25}
+    with SampleReader(out) as reader:
+        assert reader.mapping.unused == tuple(f"{layer}.{name}" for name in "BGR")
 
 
 def test_windows_and_user_attributes_are_kept(tmp_path):
@@ -406,7 +443,7 @@ def test_patterns_one_per_seed_and_single_files_are_planned_alike(shot):
 
 
 @pytest.mark.parametrize(("sources", "target", "options", "error", "message"), [
-    (["shot.s@SEED@.####.exr"], "deep.####.exr", {"seeds": "1-4"}, InputError, "2 of 2 frames are missing: 10-11"),
+    (["shot.s@SEED@.####.exr"], "deep.####.exr", {"seeds": "1-4"}, InputError, r"s4\.####\.exr: no file matches"),
     (["shot.s@SEED@.####.exr"], "deep.exr", {"seeds": "1-3"}, InputError, "OUT is a single file"),
     (["shot.s1.####.exr"], "deep.exr", {}, InputError, "OUT is a single file"),
     (["shot.s1.####.exr", "shot.s2.0010.exr"], "deep.####.exr", {}, InputError, "single file among sequences"),
@@ -421,3 +458,25 @@ def test_patterns_one_per_seed_and_single_files_are_planned_alike(shot):
 def test_plans_that_make_no_sense_are_errors(shot, sources, target, options, error, message):
     with pytest.raises(error, match=message):
         plan([shot(name) for name in sources], shot(target), **options)
+
+
+def test_a_frame_that_any_seed_lacks_is_missed(shot):
+    shot("shot.s1.0010.exr").unlink()
+    for seeds in ((1, 2), (2, 1)):
+        with pytest.raises(InputError, match=r"s1\.####\.exr: 1 of 2 frames are missing: 10"):
+            plan([shot(f"shot.s{seed}.####.exr") for seed in seeds], shot("out.####.exr"))
+
+
+def test_seeds_keep_their_zeros(tmp_path):
+    for seed in range(8, 12):
+        (tmp_path / f"s{seed:02d}.exr").touch()
+    (job,) = plan([tmp_path / "s@SEED@.exr"], tmp_path / "out.exr", "08-11")
+    assert [source.name for source in job.sources] == ["s08.exr", "s09.exr", "s10.exr", "s11.exr"]
+
+
+def test_a_render_in_the_place_of_the_output_is_not_overwritten(tmp_path):
+    paths = write_renders(tmp_path, [render(seed) for seed in range(3)])
+    before = paths[-1].read_bytes()
+    with pytest.raises(UsageError, match="is a flat EXR, which pack does not replace; name OUT last"):
+        pack_frames(plan(paths[:-1], paths[-1]), PackOptions(existing="overwrite"))
+    assert paths[-1].read_bytes() == before
