@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import struct
 from dataclasses import dataclass
+from operator import mul
 from typing import BinaryIO
 
 import numpy as np
@@ -24,6 +25,9 @@ from deep_io.samples import Window
 _SIZES = struct.Struct("<3Q")
 # Bytes between the part number and the sizes in a chunk's leader.
 _COORDINATES = {"scanlineimage": 4, "deepscanline": 4, "tiledimage": 16, "deeptile": 16}
+# Rows of a flat scanline part that are stored together.
+_ROWS_PER_CHUNK = {"none": 1, "rle": 1, "zips": 1, "zip": 16, "piz": 32, "pxr24": 16, "b44": 32, "b44a": 32,
+                   "dwaa": 32, "dwab": 256, "htj2k256": 256, "htj2k32": 32, "lj2k": 256, "zstd": 1}
 _RATIO_SLACK = 64        # Streams of a few bytes unpack to a little more than the ratio allows.
 MAX_CHUNK = 2**31 - 1    # OpenEXR's own limit, packed and unpacked.
 
@@ -49,15 +53,49 @@ class Tile:
 
 def chunk_count(header: Header, where: str) -> int:
     """How many chunks the part has. Raises InputError when the header does not say and it cannot be derived."""
+    height, count = header.data_window.height, header.get("chunkCount")
     if header.type == "deepscanline":
-        height = header.data_window.height
-        if header.get("chunkCount", height) != height:
-            raise InputError(f"{where}: the header promises {header.get('chunkCount')} chunks for {height} rows")
+        if count is not None and count != height:
+            raise InputError(f"{where}: the header promises {count} chunks for {height} rows")
         return height
-    count = header.get("chunkCount")
+    if header.type == "tiledimage":
+        return _tile_count(header, where)
+    if header.type == "scanlineimage" and header.compression in _ROWS_PER_CHUNK:
+        return -(-height // _ROWS_PER_CHUNK[header.compression])
     if not isinstance(count, int) or count < 0:
         raise InputError(f"{where}: the header has no chunkCount")
     return count
+
+
+def tile_description(header: Header, where: str) -> tuple[int, int, int]:
+    """A tile's width and height, and the byte that says which levels there are. Raises InputError."""
+    tiles = header.structure.get("tiles")
+    if tiles is None or tiles.type != "tiledesc" or not isinstance(tiles.value, tuple):
+        raise InputError(f"{where}: the header's tiles are missing or corrupt")
+    width, height, levels = tiles.value
+    if not 0 < min(width, height) <= max(width, height) < 2**31:
+        raise InputError(f"{where}: the header's tiles are corrupt: {width} x {height}")
+    return width, height, levels
+
+
+def _tile_count(header: Header, where: str) -> int:
+    """Tiles of all levels: of the picture alone, of a mipmap, or of a ripmap, which has every pair of sizes."""
+    *tile, levels = tile_description(header, where)
+    kind, rounds_up = levels & 0xF, bool(levels >> 4)
+    if kind > 2:
+        raise InputError(f"{where}: the header's tiles are corrupt: levels of kind {kind}")
+
+    def across(extent: int, size: int, largest: int) -> list[int]:
+        """Tiles along one axis in each level, down to where `largest` pixels have become one."""
+        count = 1 + ((largest - 1).bit_length() if rounds_up else largest.bit_length() - 1)
+        extents = [max(-(-extent >> level) if rounds_up else extent >> level, 1) for level in range(count)]
+        return [-(-extent // size) for extent in extents]
+
+    width, height = header.data_window.width, header.data_window.height
+    if kind == 2:
+        return sum(across(width, tile[0], width)) * sum(across(height, tile[1], height))
+    largest = max(width, height) if kind else 1
+    return sum(map(mul, across(width, tile[0], largest), across(height, tile[1], largest)))
 
 
 def read_rows(file: BinaryIO, headers: FileHeaders, part: int, path: str) -> list[Chunk]:
@@ -121,23 +159,6 @@ def read_tiles(file: BinaryIO, headers: FileHeaders, part: int, path: str, size:
     return [[tiles[y, x] for x in range(across)] for y in range(down)]
 
 
-def check_chunks(file: BinaryIO, headers: FileHeaders, part: int, path: str) -> int:
-    """Check the chunk sizes of any deep part against the file; the number of bytes its samples unpack to.
-
-    Raises InputError when the part cannot hold what its header promises or a chunk does not fit the file.
-    """
-    header, where = headers.parts[part], part_label(headers, part, path)
-    file_size = os.fstat(file.fileno()).st_size
-    offsets = _read_chunk_table(file, file_size, headers, part, path)
-    total = 0
-    for index, offset in enumerate(offsets.tolist()):
-        label = f"{where}: chunk {index} of {offsets.size}"
-        chunk = _read_leader(file, file_size, headers, part, offset, label)
-        _check_sizes(chunk, None, header, file_size, label)
-        total += chunk.unpacked
-    return total
-
-
 def _read_leader(file: BinaryIO, file_size: int, headers: FileHeaders, part: int, offset: int, label: str) -> Chunk:
     coordinates = _COORDINATES[headers.parts[part].type]
     before = 4 * headers.multipart
@@ -152,16 +173,16 @@ def _read_leader(file: BinaryIO, file_size: int, headers: FileHeaders, part: int
                  *_SIZES.unpack_from(data, before + coordinates))
 
 
-def _check_sizes(chunk: Chunk, pixels: int | None, header: Header, file_size: int, label: str, spare: int = 0) -> None:
+def _check_sizes(chunk: Chunk, pixels: int, header: Header, file_size: int, label: str, spare: int = 0) -> None:
     """Refuse sizes beyond the file, and contents that no packed data of that size can stand for."""
     ratio = MAX_RATIO[header.compression]
     if chunk.table_size + chunk.data_size > file_size - chunk.start:
         raise InputError(f"{label}: runs past the end of the file (truncated or corrupt)")
     if (chunk.unpacked % header.sample_bytes or max(chunk.unpacked, chunk.data_size, chunk.table_size) > MAX_CHUNK
-            or (pixels is not None and chunk.table_size > 4 * pixels + spare)):
+            or chunk.table_size > 4 * pixels + spare):
         raise InputError(f"{label}: its sizes do not fit its channels (corrupt)")
     if (chunk.unpacked > ratio * chunk.data_size + _RATIO_SLACK
-            or (pixels is not None and 4 * pixels > ratio * chunk.table_size + _RATIO_SLACK)):
+            or 4 * pixels > ratio * chunk.table_size + _RATIO_SLACK):
         raise InputError(f"{label}: promises more than its packed bytes can hold (corrupt)")
 
 

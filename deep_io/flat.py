@@ -1,16 +1,15 @@
 """Flat EXRs, single- and multi-part, read and written through the OpenEXR library.
 
 Attributes do not go through the library: headers are read and written by header.py, so that a user attribute of any
-type survives byte for byte. That a file appears whole or not at all is atomic.py's business.
+type survives byte for byte. How the library is made to read is library.py's business, that a file appears whole or
+not at all atomic.py's.
 """
 
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -19,19 +18,9 @@ from numpy.typing import NDArray
 
 from deep_io.attributes import Attribute
 from deep_io.errors import InputError
-from deep_io.header import (
-    FORMAT_VERSION,
-    LONG_NAMES,
-    MAGIC,
-    MULTI_PART,
-    FileHeaders,
-    Header,
-    channels_of,
-    encode_header,
-    needs_long_names,
-    parse_headers,
-    read_headers,
-)
+from deep_io.header import Header, channels_of, open_input, parse_headers
+from deep_io.library import read_with_library
+from deep_io.reheading import last_flat_chunk_end, read_chunk_table, reheaded
 from deep_io.samples import Window
 
 PathLike = str | os.PathLike[str]
@@ -43,8 +32,6 @@ COMPRESSIONS = {
     "b44": OpenEXR.B44_COMPRESSION, "b44a": OpenEXR.B44A_COMPRESSION, "dwaa": OpenEXR.DWAA_COMPRESSION,
     "dwab": OpenEXR.DWAB_COMPRESSION,
 }  # fmt: skip
-_ROWS_PER_CHUNK = {"none": 1, "rle": 1, "zips": 1, "zip": 16, "piz": 32, "pxr24": 16, "b44": 32, "b44a": 32,
-                   "dwaa": 32, "dwab": 256}
 
 # Attributes that describe an input's pixels or our own job, not the picture: an output does not inherit them.
 _NOT_KEPT = ("preview", "deepImageState")
@@ -118,29 +105,25 @@ def read_flat(path: PathLike, part: int | str | None = None) -> FlatImage:
 
 
 def read_flat_parts(path: PathLike) -> list[FlatImage]:
-    """All parts of a flat EXR. Raises InputError when the file is unreadable, corrupt, deep or subsampled."""
+    """All parts of a flat EXR.
+
+    Raises InputError when the file is unreadable, corrupt, deep or subsampled, MemoryError when it does not fit.
+    """
     name = os.fspath(path)
-    headers = read_headers(path)
-    if any(header.is_deep for header in headers):
-        raise InputError(f"{name}: is a deep EXR where a flat one is needed")
-    if any(channel.sampling != (1, 1) for header in headers for channel in header.channels):
-        raise InputError(f"{name}: has subsampled channels; convert it to full resolution")
-    try:
-        try:
-            parts = _library_parts(name)
-        except RuntimeError as error:
-            # The library gives up on a whole file for one attribute of a type that its Python side does not know.
-            if "unsupported attribute type" not in str(error):
-                raise
-            parts = _library_parts(_without_attributes(path))
-    except (RuntimeError, OSError, ValueError) as error:
-        raise InputError(f"{name}: cannot be read: {' '.join(str(error).split())}") from error
-    if len(parts) != len(headers):
-        raise InputError(f"{name}: the pixels are truncated or corrupt")
+    with open_input(path) as file:
+        headers = parse_headers(file, name)
+        if any(header.is_deep for header in headers.parts):
+            raise InputError(f"{name}: is a deep EXR where a flat one is needed")
+        if any(channel.sampling != (1, 1) for header in headers.parts for channel in header.channels):
+            raise InputError(f"{name}: has subsampled channels; convert it to full resolution")
+        size = os.fstat(file.fileno()).st_size
+        if last_flat_chunk_end(file, headers, read_chunk_table(file, headers, name)) > size:
+            raise InputError(f"{name}: the pixels are truncated or corrupt: they run past the end of the file")
+        parts = read_with_library(file, headers, name)
     images = []
-    for header, channels in zip(headers, parts, strict=True):
+    for header, channels in zip(headers.parts, parts, strict=True):
         shape = (header.data_window.height, header.data_window.width)
-        if set(channels) != set(header.channel_names) or any(np.shape(p) != shape for p in channels.values()):
+        if any(np.shape(pixels) != shape for pixels in channels.values()):
             raise InputError(f"{name}: the pixels are truncated or corrupt")
         images.append(FlatImage(channels, header))
     return images
@@ -188,67 +171,25 @@ def _library_header(header: Header, compression: str) -> dict[str, Any]:
             "pixelAspectRatio": float(header.pixel_aspect)}
 
 
-def _library_parts(file: str | BytesIO) -> list[dict[str, Pixels]]:
-    """The channels of every part. Corrupt pixels are a mere warning to the library: parts are then missing or empty."""
-    with warnings.catch_warnings(), OpenEXR.File(file, separate_channels=True) as opened:
-        warnings.simplefilter("ignore")
-        return [{key: channel.pixels for key, channel in part.channels.items()} for part in opened.parts]
-
-
-def _without_attributes(path: PathLike) -> BytesIO:
-    """The file in memory, with none but the attributes that an EXR must have."""
-    with open(path, "rb") as file:
-        written = parse_headers(file, os.fspath(path))
-        file.seek(0)
-        return BytesIO(_with_headers(file.read(), written, [replace(part, attributes={}) for part in written.parts]))
-
-
 def _set_attributes(path: PathLike, images: Sequence[FlatImage]) -> None:
-    """Give the headers of a finished file all the attributes of `images`. Raises OSError where it is not whole."""
-    with open(path, "r+b") as file:
-        try:
-            written = parse_headers(file, os.fspath(path))
-        except InputError as error:
-            raise OSError(_NOT_WHOLE) from error
-        headers = [replace(mine, attributes={**mine.attributes, **image.header.attributes})
-                   for mine, image in zip(written.parts, images, strict=True)]
-        file.seek(0)
-        whole = file.read()
-        _check_whole(whole, written)
-        file.seek(0)
-        file.write(_with_headers(whole, written, headers))
-        file.truncate()
-
-
-def _check_whole(whole: bytes, written: FileHeaders) -> None:
-    """Raises OSError unless the last chunk ends where the file does.
+    """Give the headers of a finished file all the attributes of `images`. Raises OSError where it is not whole.
 
     The library does not notice when the disk takes no more while it flushes its last bytes.
     """
-    table = whole[written.end:written.end + 8 * sum(map(_chunk_count, written.parts))]
-    last = int(np.frombuffer(table, "<u8").max(initial=0))
-    size_at = last + 4 + 4 * written.multipart  # after [part number and] y
-    packed = int.from_bytes(whole[size_at:size_at + 4], "little")
-    if not last or size_at + 4 + packed != len(whole):
-        raise OSError(_NOT_WHOLE)
-
-
-def _with_headers(whole: bytes, written: FileHeaders, headers: Sequence[Header]) -> bytes:
-    """A flat file with other attributes in its headers, and its chunk offsets moved along."""
-    table_end = written.end + 8 * sum(map(_chunk_count, headers))
-    offsets = np.frombuffer(whole[written.end:table_end], "<u8")
-    flags = written.flags | (LONG_NAMES if any(map(needs_long_names, headers)) else 0)
-    start = np.array([MAGIC, flags & ~0xFF | FORMAT_VERSION], "<u4").tobytes()
-    encoded = b"".join([start, *map(encode_header, headers), b"\0" if written.flags & MULTI_PART else b""])
-    # Unsigned arithmetic wraps around, so a header that got shorter is fine too.
-    moved = offsets + np.uint64((len(encoded) - written.end) % 2**64)
-    return b"".join([encoded, moved.astype("<u8").tobytes(), whole[table_end:]])
-
-
-def _chunk_count(header: Header) -> int:
-    stated = header.structure.get("chunkCount")
-    if stated is not None:
-        return int(stated.value)
-    if header.type != "scanlineimage" or header.compression not in _ROWS_PER_CHUNK:
-        raise ValueError(f"a {header.type} with {header.compression} compression and no chunkCount")
-    return -(-header.data_window.height // _ROWS_PER_CHUNK[header.compression])
+    name = os.fspath(path)
+    with open(path, "r+b") as file:
+        try:
+            written = parse_headers(file, name)
+            table = read_chunk_table(file, written, name)
+        except InputError as error:
+            raise OSError(_NOT_WHOLE) from error
+        if last_flat_chunk_end(file, written, table) != os.fstat(file.fileno()).st_size:
+            raise OSError(_NOT_WHOLE)
+        headers = [replace(mine, attributes={**mine.attributes, **image.header.attributes})
+                   for mine, image in zip(written.parts, images, strict=True)]
+        file.seek(written.end + table.nbytes)
+        chunks = file.read()
+        file.seek(0)
+        file.write(reheaded(written, table, headers))
+        file.write(chunks)
+        file.truncate()

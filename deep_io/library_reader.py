@@ -6,22 +6,32 @@ of the flat path. A MemoryCostWarning says so before it begins.
 
 from __future__ import annotations
 
+import os
+import struct
+import sys
 import warnings
 from collections.abc import Sequence
-from typing import Any, BinaryIO
+from contextlib import suppress
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_io.chunks import check_chunks, part_label
+from deep_io.chunks import Chunk, part_label, read_rows, read_tiles, tile_description
 from deep_io.errors import InputError, MemoryCostWarning
 from deep_io.header import FileHeaders
+from deep_io.library import read_with_library
 from deep_io.rows import Targets
 
-# What the library holds per pixel and channel besides the values: a NumPy array object and its reference, measured.
-_OBJECT_BYTES = 210
+# What the library holds per pixel and channel besides the values: references to an array, and where there are samples
+# a NumPy array object, measured.
+_REFERENCE_BYTES = 16
+_OBJECT_BYTES = 194
 # The library's own frame, the arrays made of it and the flat arrays.
 _VALUE_COPIES = 3
+# OpenEXR's wrapping of a ZSTD frame: magic, format and flags, size of the frame, and the frame's own magic.
+_PREFIX = struct.Struct("<8s8sQ4s")
+_MAGIC, _FRAME_MAGIC = b"zstd-exr", b"\x28\xb5\x2f\xfd"
 
 
 class LibraryRows:
@@ -36,14 +46,17 @@ class LibraryRows:
         header = headers.parts[part]
         window = header.data_window
         where = part_label(headers, part, path)
-        estimate = (check_chunks(file, headers, part, path) * _VALUE_COPIES
-                    + window.width * window.height * len(header.channels) * _OBJECT_BYTES)
+        unpacked = _check_chunks(file, headers, part, path)
+        pixels = window.width * window.height
+        estimate = unpacked * _VALUE_COPIES + len(header.channels) * (
+            pixels * _REFERENCE_BYTES + min(pixels, unpacked // header.sample_bytes) * _OBJECT_BYTES)
+        if estimate > _machine_memory():
+            raise InputError(f"{where}: reading its ZSTD deep data takes about {estimate >> 20} MiB of memory, more "
+                             f"than this machine has; write it with ZIPS, which streams")
         warnings.warn(f"{where}: ZSTD deep data is read through the OpenEXR library, the whole frame at once: slow, "
                       f"and takes about {max(estimate >> 20, 1)} MiB of memory; ZIPS would stream",
                       MemoryCostWarning, stacklevel=4)
-        arrays = _read(path, part, where)
-        if sorted(arrays) != sorted(header.channel_names):
-            raise InputError(f"{where}: the OpenEXR library cannot read its pixels (corrupt?)")
+        arrays = read_with_library(file, headers, path)[part]
         self._counts: NDArray[np.int32] | None = None
         self._values: list[NDArray[np.generic]] = []
         for channel in header.channels:
@@ -75,12 +88,45 @@ class LibraryRows:
         self._counts, self._values = None, []
 
 
-def _read(path: str, part: int, where: str) -> dict[str, NDArray[Any]]:
-    """Channel name -> (H, W) object array of one array per pixel. Raises InputError."""
-    import OpenEXR  # 70 ms of start-up that flat files and the scanline path do not need.
+def _check_chunks(file: BinaryIO, headers: FileHeaders, part: int, path: str) -> int:
+    """Check what can be told of a ZSTD part's chunks without inflating them; the bytes that its samples unpack to.
 
-    try:
-        parts = OpenEXR.File(path, separate_channels=True).parts
-        return {name: channel.pixels for name, channel in parts[part].channels.items()}
-    except Exception as error:  # The library raises RuntimeError and others of its own; corrupt files leave no parts.
-        raise InputError(f"{where}: the OpenEXR library cannot read it: {' '.join(str(error).split())}") from error
+    Raises InputError, naming the row or the tile's row, when the part cannot hold what its header promises.
+    """
+    header, where = headers.parts[part], part_label(headers, part, path)
+    if header.type == "deeptile":
+        width, height, _ = tile_description(header, where)
+        chunks = [(tile.chunk, tile.window) for band in read_tiles(file, headers, part, path, (width, height))
+                  for tile in band]
+    else:
+        window = header.data_window
+        chunks = [(chunk, window.rows(y, y + 1)) for y, chunk
+                  in enumerate(read_rows(file, headers, part, path), window.ymin)]
+    for chunk, covers in chunks:
+        if not _is_packed(file, chunk, 4 * covers.width * covers.height):
+            raise InputError(f"{where}: row {covers.ymin}: the compressed data is corrupt")
+    return sum(chunk.unpacked for chunk, _ in chunks)
+
+
+def _is_packed(file: BinaryIO, chunk: Chunk, table_bytes: int) -> bool:
+    """Whether a chunk's count table and samples are ZSTD frames, as OpenEXR wraps them, or stored raw."""
+    places = ((chunk.start, chunk.table_size, table_bytes),
+              (chunk.start + chunk.table_size, chunk.data_size, chunk.unpacked))
+    for start, size, unpacked in places:
+        if size >= unpacked:
+            continue
+        file.seek(start)
+        prefix = file.read(_PREFIX.size)
+        if len(prefix) < _PREFIX.size or size < _PREFIX.size:
+            return False
+        magic, _, packed, frame = _PREFIX.unpack(prefix)
+        if (magic, frame) != (_MAGIC, _FRAME_MAGIC) or packed != size - _PREFIX.size + len(_FRAME_MAGIC):
+            return False
+    return True
+
+
+def _machine_memory() -> int:
+    """Bytes that the machine has; no limit where the system does not tell."""
+    with suppress(AttributeError, ValueError, OSError):
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return sys.maxsize

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_io import codec
-from deep_io.chunks import Chunk, Tile, part_label, read_rows, read_tiles
+from deep_io.chunks import Chunk, Tile, part_label, read_rows, read_tiles, tile_description
 from deep_io.errors import InputError
 from deep_io.header import FileHeaders, Header
 
@@ -128,11 +128,9 @@ class TileRows(_ChunkDecoder):
 
     def __init__(self, file: BinaryIO, headers: FileHeaders, part: int, path: str) -> None:
         super().__init__(file, headers, part, path)
-        tiles = self._header.get("tiles")
-        if not isinstance(tiles, tuple) or not 0 < min(tiles[:2]) <= max(tiles[:2]) < 2**31:
-            raise InputError(f"{self._where}: the header's tiles are corrupt")
-        self._tiles = read_tiles(file, headers, part, path, tiles[:2])
-        self.block = self.task = tiles[1]
+        width, height, _ = tile_description(self._header, self._where)
+        self._tiles = read_tiles(file, headers, part, path, (width, height))
+        self.block = self.task = height
         window = self._header.data_window
         self._table = np.empty((window.height, window.width), np.int32)
         for tile in itertools.chain.from_iterable(self._tiles):

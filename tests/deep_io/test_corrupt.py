@@ -243,3 +243,48 @@ def test_refused_files_are_closed(damaged):
     for _ in range(5):
         damaged.refused("row 6")
     assert len(os.listdir("/proc/self/fd")) == before
+
+
+def zstd_rows(path, width, rows, table):
+    """A ZSTD file without samples, every row of which has `table` as its packed count table."""
+    promise(path, Window(0, 0, width - 1, rows - 1), "zstd")
+    size = LEADER.size + len(table)
+    start = path.stat().st_size + 8 * rows
+    with path.open("ab") as file:
+        file.write(b"".join(struct.pack("<q", start + row * size) for row in range(rows)))
+        file.write(b"".join(LEADER.pack(row, len(table), 0, 0) + table for row in range(rows)))
+
+
+@pytest.mark.parametrize("table", [bytes(40), b"zstd-exr".ljust(40, b"\0"),
+                                   b"zstd-exr" + bytes(8) + struct.pack("<Q", 10**6) + b"\x28\xb5\x2f\xfd" + bytes(12)])
+def test_what_is_no_zstd_is_refused_before_the_library_allocates_the_frame(tmp_path, table):
+    zstd_rows(tmp_path / "bad.exr", 200_000, 30, table)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match=r"bad\.exr: row 0: the compressed data is corrupt$"):
+        DeepReader(tmp_path / "bad.exr")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 20_000  # kB
+
+
+def test_damage_that_only_the_library_sees_names_the_file_and_prints_nothing(tmp_path, capfd):
+    table = b"zstd-exr\1" + bytes(7) + struct.pack("<Q", 16) + b"\x28\xb5\x2f\xfd" + bytes(12)
+    zstd_rows(tmp_path / "bad.exr", 200, 3, table)
+    with pytest.warns(MemoryCostWarning), pytest.raises(InputError, match=r"bad\.exr: .*\(OpenEXR: Unable to"):
+        DeepReader(tmp_path / "bad.exr")
+    assert capfd.readouterr().out == ""
+
+
+def test_a_zstd_frame_that_the_machine_cannot_hold_is_refused(tmp_path, monkeypatch):
+    write_openexr(tmp_path / "large.exr", openexr_part(random_samples(), "zstd"))
+    monkeypatch.setattr("deep_io.library_reader._machine_memory", lambda: 1000)
+    with pytest.raises(InputError, match=r"large\.exr: reading its ZSTD deep data takes about \d+ MiB of memory, more"):
+        DeepReader(tmp_path / "large.exr")
+
+
+def test_zstd_data_is_read_whatever_the_attributes_are(tmp_path):
+    path = tmp_path / "odd.exr"
+    write_openexr(path, openexr_part(random_samples(), "zstd", owner="Mxller"))
+    path.write_bytes(path.read_bytes().replace(b"Mxller", b"M\xfcller"))
+    with pytest.warns(MemoryCostWarning):
+        samples, header = read_deep(path)
+    assert samples.total == random_samples().total
+    assert header.get("owner") == "M\udcfcller"
