@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+from contextlib import nullcontext, redirect_stdout
 from typing import Any
 
 import click
@@ -34,11 +36,13 @@ def compare(as_json: bool, no_flip: bool, **choices: Any) -> int:
     """
     from pipelines.compare import CompareOptions, compare_frames, comparison_as_dict, comparison_lines
 
-    report = compare_frames(CompareOptions(flip=not no_flip, **choices))
+    # in JSON on standard output, the lines of --progress openjd would be no JSON
+    with redirect_stdout(sys.stderr) if as_json else nullcontext():
+        report = compare_frames(CompareOptions(flip=not no_flip, **choices))
     if as_json:
         click.echo(json.dumps(comparison_as_dict(report.values), indent=2))
     elif report.values:
         click.echo("\n".join(comparison_lines(report.values)))
-    if len(report.frames) > 1:
+    if len(report.frames) > 1 or report.failed:
         return end_job(report)
     return report.exit_code

@@ -34,9 +34,9 @@ def denoise(**choices: Any) -> int:
     options = build_options(DenoiseOptions, **job_choices(**choices))
     from pipelines.frames import find_frames
 
-    find_frames(options)  # a missing input is said at once, not after the import of torch
+    frames = find_frames(options)  # a missing input is said at once, not after the import of torch
     from pipelines.allocator import keep_freed_memory
     from pipelines.denoise import denoise_frames
 
     keep_freed_memory()
-    return end_job(denoise_frames(options))
+    return end_job(denoise_frames(options, frames))

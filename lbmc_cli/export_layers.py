@@ -53,9 +53,9 @@ def export_layers(**choices: Any) -> int:
     options = build_options(ExportOptions, **job_choices(**choices))
     from pipelines.frames import find_frames
 
-    find_frames(options)  # a missing input is said at once, not after the import of torch
+    frames = find_frames(options)  # a missing input is said at once, not after the import of torch
     from pipelines.allocator import keep_freed_memory
     from pipelines.export import export_frames
 
     keep_freed_memory()
-    return end_job(export_frames(options))
+    return end_job(export_frames(options, frames))

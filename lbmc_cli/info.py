@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from lbmc_cli.options import LbmcCommand, option, part_choice, reading_options
+from lbmc_cli.options import LbmcCommand, option, reading_options
 
 
 @click.command(cls=LbmcCommand)
@@ -24,7 +24,7 @@ def info(source: str, as_json: bool, part: str | None, **choices: Any) -> None:
         click.echo(json.dumps(found.as_dict(), indent=2, allow_nan=False) if as_json else "\n".join(found.lines()))
 
     try:
-        show(file_info(source, part=part_choice(part), **choices))
+        show(file_info(source, part=part, **choices))
     except InputError:  # whoever asks why a file is refused wants to see what is in it
-        show(refused_file(source, part_choice(part), choices["overrides"]))
+        show(refused_file(source, part, choices["overrides"]))
         raise

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from lbmc_cli.options import PROGRESS, THREADS, ByteSize, Device, option, part_choice, reading_options, together
+from lbmc_cli.options import PROGRESS, THREADS, ByteSize, Device, option, reading_options, together
 from lbmc_cli.report import existing_choice
 from pipelines.options import ALL_LAYERS
 
@@ -14,16 +14,14 @@ from pipelines.options import ALL_LAYERS
 def _layers(ctx: click.Context, parameter: click.Parameter, value: str) -> int | None:
     if value == "auto":
         return None
-    if value.isdigit() and 1 <= int(value) <= ALL_LAYERS:
+    if value.isdecimal() and 1 <= int(value) <= ALL_LAYERS:
         return int(value)
     raise click.BadParameter(f"{value!r} is not auto or a number from 1 to {ALL_LAYERS}", ctx, parameter)
 
 
-def job_choices(overwrite: bool, skip_existing: bool, part: str | None, no_adapt: bool, **choices: Any
-                ) -> dict[str, Any]:
+def job_choices(overwrite: bool, skip_existing: bool, no_adapt: bool, **choices: Any) -> dict[str, Any]:
     """The groups' values as the fields of DenoiseOptions."""
-    return {"existing": existing_choice(overwrite, skip_existing), "part": part_choice(part), "adapt": not no_adapt,
-            **choices}
+    return {"existing": existing_choice(overwrite, skip_existing), "adapt": not no_adapt, **choices}
 
 
 job_options = together(

@@ -76,7 +76,7 @@ def lbmc(debug: bool) -> None:
     """Denoise deep EXRs whose samples are Monte Carlo path samples.
 
     Every option can also be given as an environment variable: LBMC_THREADS for --threads of every command,
-    LBMC_DENOISE_THREADS for that of denoise alone.
+    LBMC_DENOISE_THREADS for that of denoise alone. One of a repeatable option holds a value a line.
     """
 
 

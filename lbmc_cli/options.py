@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, TypeVar
 
@@ -14,6 +14,12 @@ from click.core import ParameterSource
 Options = TypeVar("Options")
 
 MOST_THREADS = 1024  # more than any machine has; far more crash the numeric libraries
+
+RIVALS = tuple(map(frozenset, (
+    ("overwrite", "skip_existing"), ("exposure", "exposure_from"), ("scene", "layout"),
+    ("samples", "form"), ("samples", "contributions"), ("samples", "aovs"), ("samples", "ids"),
+)))
+"""Pairs of options that exclude each other: of two, that of the command line wins over that of the environment."""
 
 _UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
@@ -46,8 +52,22 @@ def _note_debug(ctx: click.Context, parameter: click.Parameter | None, value: bo
 class LbmcOption(click.Option):
     """An option that LBMC_<COMMAND>_<OPTION>, or LBMC_<OPTION> for all commands at once, can stand in for.
 
-    The name is that of the first flag: LBMC_NO_ADAPT=1 for --no-adapt.
+    The name is that of the first flag: LBMC_NO_ADAPT=1 for --no-adapt. A variable holds the values of a repeatable
+    option a line each, and counts for nothing where the option that excludes its own is on the command line.
     """
+
+    def consume_value(self, ctx: click.Context, opts: Mapping[str, Any]) -> tuple[Any, ParameterSource]:
+        value, source = super().consume_value(ctx, opts)
+        rivals = {name for pair in RIVALS if self.name in pair for name in pair} - {self.name}
+        if source is ParameterSource.ENVIRONMENT and rivals & opts.keys():
+            return self.get_default(ctx), ParameterSource.DEFAULT
+        return value, source
+
+    def value_from_envvar(self, ctx: click.Context) -> Any:
+        text = self.resolve_envvar_value(ctx)
+        if text is None or not self.multiple:
+            return super().value_from_envvar(ctx)
+        return [line.strip() for line in text.splitlines() if line.strip()]
 
     def resolve_envvar_value(self, ctx: click.Context) -> str | None:
         name = self._variable(ctx)
@@ -118,11 +138,6 @@ def build_options(kind: Callable[..., Options], **choices: Any) -> Options:
         return kind(**choices)
     except ValueError as error:
         raise click.UsageError(str(error), click.get_current_context()) from error
-
-
-def part_choice(part: str | None) -> str | int | None:
-    """--part as the pipelines take it: digits are a number."""
-    return int(part) if part is not None and part.isdigit() else part
 
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]

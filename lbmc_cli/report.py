@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def existing_choice(overwrite: bool, skip_existing: bool) -> Existing:
-    """The two flags as one choice. Raises UsageError when both are set."""
+    """The two flags as one choice. Raises UsageError when both are set, both on the command line or neither there."""
     if overwrite and skip_existing:
         raise click.UsageError("--overwrite and --skip-existing exclude each other", click.get_current_context())
     return "overwrite" if overwrite else "skip" if skip_existing else "refuse"
@@ -21,13 +21,11 @@ def existing_choice(overwrite: bool, skip_existing: bool) -> Existing:
 
 def end_job(report: JobReport[Any]) -> int:
     """Lists what failed (each failure was told when it happened, perhaps thousands of lines ago) and sums up."""
-    from pipelines.jobs import describe_error
-
     context = click.get_current_context()
     if len(report.frames) > 1 and report.failed:
         click.echo("failed frames:", err=True)
         for frame in report.failed:
-            click.echo(f"  {frame.label}: {describe_error(frame.error) if frame.error else ''}", err=True)
+            click.echo(f"  {frame.label}: {frame.told}", err=True)
     if isinstance(context.obj, dict) and context.obj["debug"]:
         for frame in report.failed:
             traceback.print_exception(frame.error)

@@ -14,7 +14,7 @@ from lbmc_cli.options import LbmcCommand, option
 @click.argument("data", type=click.Path(path_type=Path))
 @click.argument("out", type=click.Path(path_type=Path))
 @option("--validation", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Held-out scenes.")
-@option("--network", metavar="NAME", help="Which network to train.  [default: that of --start, else fast]")
+@option("--network", metavar="NAME", help="Which network to train.  [default: that of OUT or --start, else fast]")
 @option("--recipe", type=click.Path(path_type=Path), metavar="FILE", help="JSON file with fields of the recipe.")
 @option("--steps", type=click.IntRange(1), help="Length of the run.  [default: 4000]")
 @option("--batch", type=click.IntRange(1), help="Crops a step, of all processes together.  [default: 4]")
@@ -30,7 +30,7 @@ from lbmc_cli.options import LbmcCommand, option
 @option("--save-every", type=click.FloatRange(0, min_open=True), default=10.0, show_default=True,
         help="Minutes between checkpoints; there is one at each validation, too.")
 @option("--seconds", type=click.FloatRange(0, min_open=True), default=float("inf"),
-        help="Stop after this long, resumable.")
+        help="Stop after this long, resumable; no weights are written then.")
 @option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True,
         help="auto: the GPU if there is one.")
 @option("--threads", type=click.IntRange(1), metavar="N", help="CPU threads of each process.")

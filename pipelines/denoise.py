@@ -7,10 +7,9 @@ on its first frame and hold for all, so that nothing flickers.
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,34 +26,33 @@ from deep_io.path_samples import PathSamples
 from model.denoiser import Denoiser
 from model.features import FrameScale
 from pipelines import __version__
-from pipelines.aovs import beauty_channels, find_aovs
+from pipelines.aovs import Aovs, beauty_channels, find_aovs
 from pipelines.decisions import Decisions, decide, surprises, zero_roles
 from pipelines.frame_reader import FrameReader
 from pipelines.frames import exposure_frame, find_frames
-from pipelines.ids import find_ids, ranked_ids
+from pipelines.ids import IdChannel, find_ids, ranked_ids
 from pipelines.inference import FrameLayers, denoise_bands
 from pipelines.jobs import FrameSkippedError, JobReport, run_frames
-from pipelines.keep import find_kept, kept_channels
+from pipelines.keep import BEAUTY, WRITTEN, find_kept, kept_channels
 from pipelines.network import choose_device, find_weights, load_network, product_dtype
 from pipelines.options import DenoiseOptions
-from pipelines.plan import FramePlan, Shot, fit
+from pipelines.plan import FramePlan, Shot, fit, roles_of, writers
 from pipelines.progress import Progress, make_progress
 from pipelines.survey import Survey, survey
 from pipelines.tiles import default_memory
 
 KEEP_BLOCK_BYTES = 64 << 20
 SURVEY_SHARE = 0.15  # of a frame's progress
+LESS_MEMORY = "pass a smaller --memory, or run on a machine with more"
 MODEL_ATTRIBUTE, WEIGHTS_ATTRIBUTE, VERSION_ATTRIBUTE = "lbmc:model", "lbmc:weights", "lbmc:version"
 
 
 @dataclass(frozen=True)
 class DenoisedFrame:
-    """What became of one frame. `seconds` are wall seconds by stage: survey, network, write."""
+    """What became of one frame; a dry run writes no target."""
 
     target: Path | None
     plan: FramePlan
-    clamped: int = 0
-    seconds: dict[str, float] = field(default_factory=dict)
 
 
 class Job:
@@ -97,10 +95,11 @@ class Job:
 
     def plan(self, source: Path, reader: FrameReader, update: Callable[[float], None]) -> FramePlan:
         """Surveys a frame and decides; the first frame that holds samples decides for the shot."""
-        window = reader.header.data_window
-        aovs = find_aovs(self.options.aovs, reader.header, reader.mapping, os.fspath(source))
-        ids = find_ids(self.options.ids, reader.header, os.fspath(source))
-        kept = find_kept(reader.header, reader.weighting, self.options.keep, os.fspath(source))
+        window, name = reader.header.data_window, os.fspath(source)
+        aovs = find_aovs(self.options.aovs, reader.header, reader.mapping, name)
+        ids = find_ids(self.options.ids, reader.header, name)
+        written = writers(name, self.written(aovs, ids))
+        kept = find_kept(reader.header, reader.weighting, self.options.keep, name, written)
         reader.carry(aovs.channels("light"), aovs.channels("data"))
         room = fit(reader, self.net, self.options.layers or self.net.config.layers, self.memory)
         if room.keep and not self.options.dry_run:
@@ -127,7 +126,7 @@ class Job:
         if aovs.depth is not None and "depth" not in roles:
             raise UsageError(f"--aov {aovs.depth}: {self.weights.name} was trained without depth; choose another model")
         reader.forget(reader.mapping.sources.keys() - {*roles, "coverage"})
-        return FramePlan(source, seen, shot, roles, room.bands, room.memory, reader.mapping.lines(), aovs, ids,
+        return FramePlan(source, seen, shot, roles, room.bands, room.memory, reader.mapping, aovs, ids,
                          kept, held & {*present}, self.options.adapt)
 
     def _decide(self, source: Path, seen: Survey, weighting: str) -> Shot:
@@ -137,7 +136,7 @@ class Job:
         scale = FrameScale(options.exposure or key.exposure, key.depth)
         decided = decide(key) if options.adapt else Decisions()
         needed = 1 if decided.one_layer else self.net.config.layers
-        return Shot(scale, options.layers or needed, weighting, decided)
+        return Shot(scale, options.layers or needed, weighting, decided, roles_of(key))
 
     def _first_survey(self, source: Path, seen: Survey) -> Survey:
         """That of the job's first readable frame: a job resumed past frames that exist decides as it did at first."""
@@ -161,34 +160,41 @@ class Job:
             targets = [path for path in targets if output_action(path, [frame.source], self.options.existing)]
             if not targets:
                 raise FrameSkippedError(f"{frame.target} exists")
-        begun = time.perf_counter()
         with self.open(frame.source) as reader:
             plan = self.plan(frame.source, reader, progress.update)
             self._tell_memory(plan, progress)
             if self.options.dry_run:
-                print(f"{frame.source} -> {', '.join(map(str, targets))}")
-                for line in plan.lines():
-                    print(f"  {line}")
+                head = f"{frame.source} -> {', '.join(map(str, targets))}"
+                print(head, *(f"  {line}" for line in plan.lines()), sep="\n", flush=True)
                 return DenoisedFrame(None, plan)
             tell_repairs(frame.source, plan.survey.repairs, progress)
             self._tell_surprises(plan, progress)
-            surveyed = time.perf_counter()
-            clamped, network = self.produce(frame, targets, plan, reader, lambda done: progress.update(
+            clamped = self.produce(frame, targets, plan, reader, lambda done: progress.update(
                 SURVEY_SHARE + (1 - SURVEY_SHARE) * done))
         if clamped:
             progress.note(f"{frame.target}: {clamped} values beyond half's range were clamped; "
                           f"--pixel-type float keeps them")
-        seconds = {"survey": surveyed - begun, "network": network,
-                   "write": time.perf_counter() - surveyed - network}
-        return DenoisedFrame(frame.target, plan, clamped, seconds)
+        return DenoisedFrame(frame.target, plan)
 
     def _tell_surprises(self, plan: FramePlan, progress: Progress) -> None:
-        """Once for each thing that a frame has and the shot was decided to do without."""
+        """Once for each thing that a frame has and the shot was decided to do without, and for each role that only one
+        of the two has."""
         for what, line in surprises(plan.shot.decided, plan.survey).items():
             if what not in self._told:
                 self._told.add(what)
                 progress.note(f"{plan.source}: {line}; if it matters, pass --exposure-from with a frame that has it, "
                               f"or --no-adapt")
+        if not plan.survey.hits:
+            return
+        here, there = roles_of(plan.survey), plan.shot.roles
+        for word, other, roles in (("lacks", "has", there - here), ("has", "lacks", here - there)):
+            new = [role for role in self.net.config.roles if role in roles and f"{word} {role}" not in self._told]
+            if new:
+                self._told |= {f"{word} {role}" for role in new}
+                drop = " ".join(f"--map {role}=none" for role in new)
+                progress.note(f"{plan.source}: {word} {', '.join(new)}, which the frame that decided for the shot "
+                              f"{other}, so they may differ visibly; render all frames with the same channels, or pass "
+                              f"{drop} for all of them")
 
     def _tell_memory(self, plan: FramePlan, progress: Progress) -> None:
         """Once for a job, where a frame takes more than its budget however it is cut."""
@@ -198,13 +204,17 @@ class Job:
                           f"than the {self.memory / 2**30:.3g} GiB of --memory; have that much free")
 
     def produce(self, frame: sequences.Frame, wanted: list[Path], plan: FramePlan, reader: FrameReader,
-                update: Callable[[float], None]) -> tuple[int, float]:
-        """Denoises a frame and writes the files wanted; returns values clamped to half and the network's seconds."""
-        begun = time.perf_counter()
+                update: Callable[[float], None]) -> int:
+        """Denoises a frame and writes the files wanted; returns how many values were clamped to half's range."""
         layers = denoise_bands(reader, self.net, plan.shot.scale, plan.roles, plan.shot.layers, plan.bands, update,
                                plan.held, plan.survey.cells if plan.adapt else None)
-        network = time.perf_counter() - begun
-        return self.write(frame, wanted, plan, layers, reader.header), network
+        return self.write(frame, wanted, plan, layers, reader.header)
+
+    def written(self, aovs: Aovs, ids: Sequence[IdChannel]) -> list[tuple[str, Iterable[str]]]:
+        """What writes which channels beside the beauty, pixel means to be kept left out."""
+        depth = () if aovs.depth is None else (aovs.depth,)
+        return [(BEAUTY, WRITTEN), ("--aov", (*aovs.outputs, *depth)),
+                *((f"--ids {one.channel}", one.outputs) for one in ids)]
 
     def targets(self, frame: sequences.Frame) -> list[Path]:
         """The files that a frame becomes."""
@@ -216,9 +226,7 @@ class Job:
         """Writes those of a frame's files that are wanted; returns how many values were clamped to half's range."""
         channels, attributes, clamped = self.beauty(frame, plan, layers)
         if self.options.keep:
-            source, part = os.fspath(frame.source), self.options.part
-            kept = kept_channels(source, part, plan.shot.weighting, self.options.keep, KEEP_BLOCK_BYTES)
-            channels = {**kept, **channels}
+            channels |= kept_channels(os.fspath(frame.source), self.options.part, plan.kept, KEEP_BLOCK_BYTES)
         for target in wanted:
             with atomic_output(target) as temporary:
                 write_flat(temporary, channels, header, self.options.compression,
@@ -242,7 +250,7 @@ class Job:
             return channels, {}, clamped
         with self.open(frame.source) as reader:
             ids, attributes = ranked_ids(reader, self.options.part, plan.ids)
-        return {**ids, **channels}, attributes, clamped
+        return {**channels, **ids}, attributes, clamped
 
     def provenance(self) -> dict[str, str]:
         """Header attributes that say what made a file; no times, so that the same input gives the same bytes."""
@@ -253,17 +261,19 @@ class Job:
         }
 
 
-def denoise_frames(options: DenoiseOptions) -> JobReport[DenoisedFrame]:
-    """Denoises a file or a sequence; failed frames do not stop the others.
+def denoise_frames(options: DenoiseOptions, frames: Sequence[sequences.Frame] | None = None
+                   ) -> JobReport[DenoisedFrame]:
+    """Denoises a file or a sequence; failed frames do not stop the others. `frames`: where they were found already.
 
     Raises InputError or UsageError for what concerns the whole job, before any frame is touched.
     """
-    return run_job(Job, options)
+    return run_job(Job, options, frames)
 
 
-def run_job(kind: type[Job], options: DenoiseOptions) -> JobReport[DenoisedFrame]:
+def run_job(kind: type[Job], options: DenoiseOptions, frames: Sequence[sequences.Frame] | None = None
+            ) -> JobReport[DenoisedFrame]:
     """Runs a job of some kind on the frames that its options name; raises what `denoise_frames` does."""
-    frames = find_frames(options)
+    frames = find_frames(options) if frames is None else frames
     job = kind(options)
     job.sources = [frame.source for frame in frames]
     to_do = options.dry_run
@@ -276,7 +286,7 @@ def run_job(kind: type[Job], options: DenoiseOptions) -> JobReport[DenoisedFrame
         job.key = job.survey_of(key)  # all frames depend on it: what is wrong with it fails the job, once
     progress = make_progress(options.progress, len(frames))
     with progress:
-        return run_frames(frames, job.frame, progress, str)
+        return run_frames(frames, job.frame, progress, str, cure=LESS_MEMORY)
 
 
 def surveyed(source: Path, blocks: Iterable[PathSamples], reader: FrameReader) -> Survey:

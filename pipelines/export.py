@@ -6,7 +6,7 @@ layers become over form is deep_io/layer_encoding.py's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -24,10 +24,12 @@ from deep_io.layer_encoding import OverLayers, deep_samples, encode_layers
 from deep_io.roles import MISS_DEPTH
 from deep_io.sequences import Frame
 from deep_io.weighting import ATTRIBUTE as WEIGHTING_ATTRIBUTE
+from pipelines.aovs import Aovs
 from pipelines.denoise import DenoisedFrame, Job, run_job, to_pixel_type
 from pipelines.export_options import ExportOptions
 from pipelines.export_samples import SamplesJob
 from pipelines.frame_reader import FrameReader
+from pipelines.ids import IdChannel
 from pipelines.inference import FrameLayers
 from pipelines.jobs import JobReport
 from pipelines.plan import FramePlan
@@ -74,6 +76,14 @@ class ExportJob(Job):
         if self.options.form != "files":
             return [frame.target]
         return [layer_path(frame.target, layer) for layer in range(self.layers)]
+
+    def written(self, aovs: Aovs, ids: Sequence[IdChannel]) -> list[tuple[str, Iterable[str]]]:
+        """The layers' own channels too, where they are in one part with the beauty."""
+        there = super().written(aovs, ids)
+        if self.options.form == "channels":
+            names = ("R", "G", "B", *aovs.outputs, "A", "Z")
+            there.append(("the layers", [f"layer{layer}.{name}" for layer in range(self.layers) for name in names]))
+        return there
 
     @property
     def layers(self) -> int:
@@ -155,12 +165,13 @@ class ExportJob(Job):
         return {name: attribute(value) for name, value in values.items()}
 
 
-def export_frames(options: ExportOptions) -> JobReport[DenoisedFrame]:
-    """Writes the layers of a file or a sequence; failed frames do not stop the others.
+def export_frames(options: ExportOptions, frames: Sequence[Frame] | None = None) -> JobReport[DenoisedFrame]:
+    """Writes the layers of a file or a sequence; failed frames do not stop the others. `frames`: where they were found
+    already.
 
     Raises InputError or UsageError for what concerns the whole job, before any frame is touched.
     """
-    return run_job(SamplesJob if options.samples else ExportJob, options)
+    return run_job(SamplesJob if options.samples else ExportJob, options, frames)
 
 
 def encode_rows(layers: FrameLayers, rows: slice, dtype: npt.DTypeLike, by_depth: bool) -> OverLayers:

@@ -39,8 +39,8 @@ class SamplesJob(Job):
 
     @torch.inference_mode()
     def produce(self, frame: Frame, wanted: list[Path], plan: FramePlan, reader: FrameReader,
-                update: Callable[[float], None]) -> tuple[int, float]:
-        """Band by band, so that a frame larger than memory passes too. Nothing is clamped, nothing timed apart."""
+                update: Callable[[float], None]) -> int:
+        """Band by band, so that a frame larger than memory passes too. Nothing is clamped."""
         options, layers = self.options, plan.shot.layers
         count = max(options.layers or self.net.config.layers, layers)  # those the survey does without take nothing
         names = [f"layer{layer}.weight" for layer in range(count)]
@@ -60,7 +60,7 @@ class SamplesJob(Job):
                 own = stored[first : first + deep.total].astype(dtype)
                 added = {name: np.ascontiguousarray(own[:, layer]) for layer, name in enumerate(names)}
                 writer.write(DeepSamples(deep.counts, {**deep.channels, **added}, deep.window))
-        return 0, 0.0
+        return 0
 
     def _header(self, header: Header, names: list[str], dtype: np.dtype[Any], path: str) -> Header:
         there = set(names) & set(header.channel_names)

@@ -22,6 +22,7 @@ from deep_io.path_samples import SampleReader
 from pipelines.channel_names import CRYPTOMATTE, cryptomatte_names, id_channels, layers_of
 
 RANKS = 6  # ids kept in a pixel: Cryptomatte's usual depth
+FIRST_RANK = "00.R"  # what a Cryptomatte's name is followed by in the channel of its heaviest ids
 Bits = npt.NDArray[np.uint32]
 Channels = dict[str, npt.NDArray[np.float32]]
 
@@ -34,6 +35,12 @@ class IdChannel:
     base: str
     hashed: bool
 
+    @property
+    def outputs(self) -> list[str]:
+        """The channels that are written: of each rank its id and its weight."""
+        return [f"{self.base}{number // 2:02d}.{name}" for number in range(RANKS) for name in
+                ("RG", "BA")[number % 2]]
+
 
 def find_ids(names: Sequence[str], header: Header, source: str) -> list[IdChannel]:
     """The id channels that names ask for: a channel, a layer of a single one, or a Cryptomatte (its first rank).
@@ -45,16 +52,18 @@ def find_ids(names: Sequence[str], header: Header, source: str) -> list[IdChanne
     found = []
     for name in dict.fromkeys(names):
         alone = layers.get(name, ())
-        choices = [name, f"{name}00.R", *(alone if len(alone) == 1 else ())]
+        choices = [name, name + FIRST_RANK, *(alone if len(alone) == 1 else ())]
         channel = next((choice for choice in choices if choice in types), None)
         if channel is None:
             there = ", ".join(dict.fromkeys(id_channels(header).values()))
             raise InputError(f"{source}: no id channel {name!r}; there are {there or 'none'}")
         if types[channel].itemsize != 4:
             raise InputError(f"{source}: {channel} is half, which cannot hold ids; they are uint or Cryptomatte floats")
-        base = name.removesuffix(".R").removesuffix("00")
-        found.append(IdChannel(channel, base, types[channel].kind == "f"))
-    return found
+        hashed = types[channel].kind == "f"
+        of_rank = hashed and channel.endswith(FIRST_RANK)
+        base = channel.removesuffix(FIRST_RANK) if of_rank else name.removesuffix(".R")
+        found.append(IdChannel(channel, base, hashed))
+    return list(dict.fromkeys(found))
 
 
 def ranked_ids(reader: SampleReader, part: int | str | None, wanted: Sequence[IdChannel], block_rows: int = 64
@@ -84,10 +93,7 @@ def ranked_ids(reader: SampleReader, part: int | str | None, wanted: Sequence[Id
     channels: Channels = {}
     attributes: dict[str, str] = {}
     for one in wanted:
-        for number in range(RANKS):
-            pair = f"{one.base}{number // 2:02d}."
-            channels[pair + "RB"[number % 2]] = ranks[one.channel][number, 0]
-            channels[pair + "GA"[number % 2]] = ranks[one.channel][number, 1]
+        channels |= zip(one.outputs, ranks[one.channel].reshape(-1, window.height, window.width), strict=True)
         attributes |= _metadata(one, reader.header, manifests[one.channel])
     return channels, attributes
 

@@ -16,6 +16,7 @@ from pipelines.signals import raise_if_stopped
 
 EXIT_OK = 0
 EXIT_SOME_FAILED = 1
+MORE_MEMORY = "run on a machine with more"
 NO_MEMORY = ("can't allocate memory", "out of memory")  # in the RuntimeErrors of torch, on a CPU and on a GPU
 
 Frame = TypeVar("Frame")
@@ -39,6 +40,8 @@ class FrameResult(Generic[Value]):
     error: Exception | None = None
     skipped: str | None = None
     """Why the frame was skipped."""
+    told: str = ""
+    """What a reader was told of the error."""
 
     @property
     def exit_code(self) -> int:
@@ -95,13 +98,15 @@ def run_frames(
     progress: Progress,
     label: Callable[[Frame], str] = str,
     here: bool = True,
+    cure: str = MORE_MEMORY,
 ) -> JobReport[Value]:
     """Calls `work(frame, progress)` for every frame in order and returns how each went.
 
     `work` may call `progress.update` and `progress.note`; begin and finish happen here. An exception fails its frame
     only: it is told at once through `progress.fail` and kept in the report. FrameSkippedError skips the frame.
-    KeyboardInterrupt, StoppedError and other BaseExceptions end the job. `here`: the work is done by this process, so
-    that its CPU seconds are those of the frame.
+    KeyboardInterrupt, StoppedError and other BaseExceptions end the job, and so does a BrokenPipeError: nobody reads
+    what the job says. `here`: the work is done by this process, so that its CPU seconds are those of the frame. `cure`:
+    what to do where memory runs out, see `describe_error`.
     """
     results: list[FrameResult[Value]] = []
     for frame in frames:
@@ -111,29 +116,34 @@ def run_frames(
         value: Value | None = None
         error: Exception | None = None
         skipped: str | None = None
+        told = ""
         try:
             value = work(frame, progress)
         except FrameSkippedError as reason:
             skipped = str(reason)
             progress.note(f"{name}: skipped, {reason}")
+        except BrokenPipeError:
+            raise
         except Exception as failure:
-            error = failure
-            progress.fail(describe_error(failure))
+            error, told = failure, describe_error(failure, cure)
+            progress.fail(told)
         seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
-        results.append(FrameResult(name, seconds, cpu_seconds, value, error, skipped))
+        results.append(FrameResult(name, seconds, cpu_seconds, value, error, skipped, told))
         progress.finish()
         raise_if_stopped()
     return JobReport(tuple(results), here)
 
 
-def describe_error(error: BaseException) -> str:
-    """One line for a reader. Errors that are not ours name their type, since their text alone rarely says enough."""
+def describe_error(error: BaseException, cure: str = MORE_MEMORY) -> str:
+    """One line for a reader. Errors that are not ours name their type, since their text alone rarely says enough.
+
+    `cure` is what the reader can do where memory ran out.
+    """
     text = " ".join(str(error).split())
     if isinstance(error, LbmcError):
         return text
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    cure = "pass a smaller --memory, or run on a machine with more"
     if isinstance(error, MemoryError):
         return f"out of memory{': ' + text if text else ''}; {cure}"
     if isinstance(error, RuntimeError) and any(words in text.lower() for words in NO_MEMORY):

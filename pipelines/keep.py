@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -15,13 +15,17 @@ from deep_io.header import Header
 from deep_io.samples import DeepSamples
 from pipelines.channel_names import id_channels
 
-WRITTEN = ("R", "G", "B", "A")  # the beauty's own channels
+Pixels = npt.NDArray[Any]
+BEAUTY = "the beauty"
+WRITTEN: Mapping[str, str] = dict.fromkeys("RGBA", BEAUTY)
 
 
-def matching_channels(header: Header, wanted: Sequence[str], source: str) -> list[str]:
-    """Channels that a request names: a channel, a layer (all its channels) or a glob, which passes ids and WRITTEN by.
+def matching_channels(header: Header, wanted: Sequence[str], source: str, written: Mapping[str, str]) -> list[str]:
+    """Channels that a request names: a channel, a layer (all its channels) or a glob, which passes ids and what is
+    written already by; `written` has the names of that, and what writes them.
 
-    Raises InputError for a request that matches nothing; the message lists what there is. UsageError for WRITTEN.
+    Raises InputError for a request that matches nothing; the message lists what there is. UsageError for a channel that
+    is written already.
     """
     names, ids = header.channel_names, id_channels(header)
     found: list[str] = []
@@ -30,23 +34,28 @@ def matching_channels(header: Header, wanted: Sequence[str], source: str) -> lis
                    or (fnmatchcase(name, request) and name not in ids)]
         if not matches:
             raise InputError(f"{source}: no channel or layer {request!r} to keep; there are {', '.join(names)}")
-        if request in WRITTEN:
+        twice = next((name for name in matches if name in written and (name == request
+                                                                       or name.startswith(f"{request}."))), None)
+        if twice is not None and written[twice] == BEAUTY:
             raise UsageError(f"--keep {request}: is the beauty's own channel, written denoised; leave it out of --keep")
-        found += [name for name in matches if name not in found and name not in WRITTEN]
+        if twice is not None:
+            raise UsageError(f"--keep {request}: {twice} is written by {written[twice]} already; leave one of them out")
+        found += [name for name in matches if name not in found and name not in written]
     return found
 
 
-def find_kept(header: Header, weighting: str, wanted: Sequence[str], source: str) -> list[str]:
-    """The names of the channels asked for, checked before any work is done.
+def find_kept(header: Header, weighting: str, wanted: Sequence[str], source: str,
+              written: Mapping[str, str] = WRITTEN) -> list[str]:
+    """The names of the channels asked for, checked before any work is done; `written` as for `matching_channels`.
 
     Raises InputError for a request that matches nothing or an id (an average of ids is no id), UsageError for a channel
-    of the beauty's own, and unless every sample weighs the same.
+    that is written already, and unless every sample weighs the same.
     """
     if not wanted:
         return []
     if weighting != "uniform":
         raise UsageError(f"{source}: --keep averages samples of equal weight, these are weighted {weighting}")
-    names = matching_channels(header, wanted, source)
+    names = matching_channels(header, wanted, source, written)
     for channel, owner in id_channels(header).items():
         if channel in names:
             raise InputError(f"{source}: channel {channel} holds ids, which cannot be averaged; leave it out of "
@@ -54,16 +63,11 @@ def find_kept(header: Header, weighting: str, wanted: Sequence[str], source: str
     return names
 
 
-def kept_channels(
-    path: str, part: int | str | None, weighting: str, wanted: Sequence[str], max_bytes: int
-) -> dict[str, npt.NDArray[Any]]:
-    """Pixel means (H, W), in the file's type, of the channels asked for; 0 where a pixel has no finite value.
-
-    Raises what `find_kept` does.
+def kept_channels(path: str, part: int | str | None, names: Sequence[str], max_bytes: int) -> dict[str, Pixels]:
+    """Pixel means (H, W), in the file's type, of channels that `find_kept` found; 0 where a pixel has no finite value.
     """
     with DeepReader(path, part) as reader:
         channels = {channel.name: channel.dtype for channel in reader.header.channels}
-        names = find_kept(reader.header, weighting, wanted, path)
         window = reader.header.data_window
         out = {name: np.zeros((window.height, window.width), channels[name]) for name in names}
         for block in reader.blocks(max_bytes, names):

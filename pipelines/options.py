@@ -25,6 +25,8 @@ Precision = Literal["auto", "fp32", "bf16", "fp16"]
 
 COMPRESSIONS = ("none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab")
 """Flat EXR compressions that every reader knows; ZSTD is left out, since older tools and Nuke cannot read it."""
+LOSSY_FOR_FLOATS = ("pxr24", "dwaa", "dwab")
+"""Those that change floats, and so would make other ids of ids; B44 changes halves alone."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ class DenoiseOptions:
     layers: int | None = None
     """1 to 5 layers. None: as many as the network has; with `adapt` 1 where the frame that decides hits nothing."""
     adapt: bool = True
-    """False: no savings; every role is modelled, every cell filtered, with as many layers as the weights hold."""
+    """False: no savings; every role is modelled, every cell filtered, with the network's own number of layers."""
     exposure: float | None = None
     """Factor that brings the radiance to the range the network was trained on. None: measured, see `exposure_from`."""
     exposure_from: str | None = None
@@ -108,3 +110,6 @@ class DenoiseOptions:
             raise ValueError("exposure and exposure_from exclude each other")
         if self.compression not in COMPRESSIONS:
             raise ValueError(f"compression must be one of {', '.join(COMPRESSIONS)}, not {self.compression}")
+        if self.ids and self.compression in LOSSY_FOR_FLOATS:
+            kept = ", ".join(name for name in COMPRESSIONS if name not in LOSSY_FOR_FLOATS)
+            raise ValueError(f"--ids: compression {self.compression} makes other ids of them; choose one of {kept}")

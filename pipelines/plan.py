@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from deep_io.errors import UsageError
+from deep_io.roles import RoleMap
 from model.denoiser import Denoiser
 from model.features import FrameScale
 from pipelines.aovs import Aovs
@@ -21,12 +23,14 @@ class Shot:
     """What is decided once for all frames of a job.
 
     decided : what its first frame, or the one that stands for it, does without
+    roles : those of that frame, used by the network or not
     """
 
     scale: FrameScale
     layers: int
     weighting: str
     decided: Decisions = field(default_factory=Decisions)
+    roles: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,7 @@ class FramePlan:
     """What will be done with one frame; `lines` say it for a reader.
 
     roles : those whose values the network reads
+    mapping : which channels play them; shown without the unused ones that something else asks for
     held : those it is told to say nothing
     adapt : whether the cells that the survey found to have nothing to do pass through
     """
@@ -44,7 +49,7 @@ class FramePlan:
     roles: tuple[str, ...]
     bands: list[Band]
     memory: int
-    mapping: list[str]
+    mapping: RoleMap
     aovs: Aovs = field(default_factory=Aovs)
     ids: Sequence[IdChannel] = ()
     kept: Sequence[str] = ()
@@ -54,8 +59,10 @@ class FramePlan:
     def lines(self) -> list[str]:
         """The plan, for `--dry-run`."""
         seen = self.survey
+        asked = {*self.kept, *(one.channel for one in self.ids),
+                 *(name for group in self.aovs.groups for name in group.channels)}
         return [
-            *self.mapping,
+            *replace(self.mapping, unused=tuple(name for name in self.mapping.unused if name not in asked)).lines(),
             f"weighting: {self.shot.weighting}",
             f"samples: {seen.samples} in {seen.pixels} pixels, {seen.empty_pixels} pixels without any",
             f"roles in use: {', '.join(self.roles)}",
@@ -69,6 +76,26 @@ class FramePlan:
             *(f"ids: {one.channel} ranked as {one.base}" for one in self.ids),
             f"bands: {len(self.bands)}, about {self.memory / 2**20:.0f} MiB",
         ]
+
+
+def roles_of(seen: Survey) -> frozenset[str]:
+    """The roles of a frame that was surveyed, but for coverage, which every frame has."""
+    return frozenset({"radiance", *seen.largest, *(() if seen.mixed is None else ("depth",))})
+
+
+def writers(source: str, written: Iterable[tuple[str, Iterable[str]]]) -> dict[str, str]:
+    """Output channel to what writes it, from pairs of that and its channels.
+
+    Raises UsageError for a channel that two of them would write.
+    """
+    found: dict[str, str] = {}
+    for writer, names in written:
+        for name in names:
+            if name in found:
+                raise UsageError(f"{source}: {name} would be written twice, by {found[name]} and by {writer}; leave "
+                                 f"one of them out")
+            found[name] = writer
+    return found
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,11 @@ BYTES_OF_RESULT = 24  # of each pixel and layer of a frame, whatever its bands
 BYTES_OF_CONTEXT = 80  # of each pixel of a frame whose bands share a context
 BYTES_TO_DECODE = 600  # the same while it is made, before the first band
 DEFAULT_MEMORY = 8 << 30
-CONTROL_GROUP = Path("/sys/fs/cgroup/memory.max")
+CONTROL_GROUPS = {  # where a hierarchy of control groups is mounted: the file of a group that has its limit
+    "sys/fs/cgroup": "memory.max",
+    "sys/fs/cgroup/unified": "memory.max",
+    "sys/fs/cgroup/memory": "memory.limit_in_bytes",
+}
 
 
 @dataclass(frozen=True)
@@ -79,14 +83,35 @@ class FrameLoad:
         return max(self.needed(rows) + self.context, BYTES_BASE + self.height * self.width * BYTES_TO_DECODE)
 
 
-def default_memory() -> int:
-    """Bytes: DEFAULT_MEMORY, or half of what the machine, or this process's control group, has, where that is less."""
+def default_memory(root: Path = Path("/")) -> int:
+    """Bytes: DEFAULT_MEMORY, or half of what the machine, or this process's control group, has, where that is less.
+
+    root : where the machine's /proc and /sys are
+    """
     there = [2 * DEFAULT_MEMORY]
     with suppress(AttributeError, ValueError, OSError):  # no sysconf, or it does not know
         there.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    with suppress(OSError, ValueError):  # no such group, or "max"
-        there.append(int(CONTROL_GROUP.read_text()))
-    return min(there) // 2
+    return min(*there, *control_group_limits(root)) // 2
+
+
+def control_group_limits(root: Path) -> list[int]:
+    """Bytes that the control groups of this process, and those around them, may have; of version 1 and 2.
+
+    Inside a container the paths of /proc/self/cgroup may be those of the machine, and what is mounted the container's
+    own group: so each mount counts itself, too. "No limit" is `max`, or a number that no machine has.
+    """
+    groups = {"/"}
+    with suppress(OSError):
+        for line in (root / "proc/self/cgroup").read_text().splitlines():
+            _, controllers, path = line.split(":", 2)
+            if controllers == "" or "memory" in controllers.split(","):
+                groups |= {path, *map(str, PurePosixPath(path).parents)}
+    limits = []
+    for mount, limit in CONTROL_GROUPS.items():
+        for group in groups:
+            with suppress(OSError, ValueError):
+                limits.append(int((root / mount / group.lstrip("/") / limit).read_text()))
+    return limits
 
 
 def plan_bands(load: FrameLoad, reach: int, shared_reach: int | None, stride: int, memory: int) -> list[Band]:

@@ -27,7 +27,7 @@ from pipelines.bench.clock import Times
 from pipelines.bench.growth import SAMPLES, SIDE, growth
 from pipelines.bench.memory import measurable, peak_memory
 from pipelines.bench.methods import PAPER, LbmcMethod, Method, MethodSpec, make, method_specs, oidn_installed
-from pipelines.bench.report import Gallery, html_report
+from pipelines.bench.report import Gallery, html_report, load_pillow
 from pipelines.bench.results import CurvePoint, Measurement, Results, SceneInfo, machine
 from pipelines.bench.scenes import Scene, find_scenes, write_enlarged, write_thinned
 from pipelines.bench.tables import markdown_report
@@ -79,9 +79,10 @@ class BenchOptions:
 def bench(options: BenchOptions) -> Results:
     """Measures, and writes results.json, results.md and report.html into `options.out`, which is made if need be.
 
-    Raises InputError for what is wrong with the folder or a scene (`find_scenes`), UsageError for outputs that exist
-    and for models that do not.
+    Raises InputError for what is wrong with the folder or a scene (`find_scenes`), UsageError without Pillow, for
+    outputs that exist and for models that do not.
     """
+    load_pillow()
     scenes = find_scenes(options.folder, options.match)
     targets = [options.out / name for name in (RESULTS, TABLE, REPORT)]
     if options.out.is_dir():

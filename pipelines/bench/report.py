@@ -59,15 +59,20 @@ class Gallery:
         self.scenes.setdefault(scene, {})[method] = png(tone_mapped(common_scale(reference) * shown))
 
 
-def png(tones: Image) -> bytes:
-    """(H, W, 3) within 0..1 as a PNG of 8 bits. Raises UsageError without Pillow."""
+def load_pillow() -> Any:
+    """The PIL.Image module. Raises UsageError with what to install."""
     try:
         from PIL import Image as Pillow
     except ImportError as missing:
         raise UsageError(f"the report's images need Pillow: install lbmc with its extra 'bench' ({missing})"
                          ) from missing
+    return Pillow
+
+
+def png(tones: Image) -> bytes:
+    """(H, W, 3) within 0..1 as a PNG of 8 bits. Raises UsageError without Pillow."""
     buffer = io.BytesIO()
-    Pillow.fromarray(np.round(255.0 * tones).astype(np.uint8)).save(buffer, format="PNG", optimize=True)
+    load_pillow().fromarray(np.round(255.0 * tones).astype(np.uint8)).save(buffer, format="PNG", optimize=True)
     return buffer.getvalue()
 
 

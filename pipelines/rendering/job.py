@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -58,12 +59,19 @@ def render_example(seed: int, settings: RenderSettings, scene: Path | None = Non
     """One example in memory. Raises RendererMissingError, and InputError for a scene file that cannot be used."""
     if scene is None:
         return take_shot(partial(_random_stage, seed, settings.layout, threads), seed, settings)
-    shot = take_shot(lambda rng: _file_tracer(scene, threads), seed, settings)
-    return replace(shot, about=shot.about | {"scene": scene.name})
+    digest = scene_digest(scene)
+    shot = take_shot(lambda rng: _file_tracer(scene, digest, threads), seed, settings)
+    return replace(shot, about=shot.about | {"scene": scene.name, "scene_digest": digest})
+
+
+def scene_digest(scene: Path) -> str:
+    """The SHA-256 of a scene file, not of the files that it refers to. Raises OSError."""
+    return hashlib.sha256(scene.read_bytes()).hexdigest()
 
 
 @lru_cache(maxsize=1)
-def _file_tracer(scene: Path, threads: int) -> FileTracer:
+def _file_tracer(scene: Path, digest: str, threads: int) -> FileTracer:
+    """The scene stays loaded between examples as long as the file is the same."""
     return FileTracer(scene, threads)
 
 
@@ -98,11 +106,13 @@ def render_scenes(options: RenderOptions, progress_kind: ProgressKind = "auto",
 
     An example is NAME.deep.exr, NAME.ref.exr and NAME.json; its JSON comes last and marks it complete, so a job that
     was stopped goes on where it was. `report` is told each example's line; the progress's notes by default.
-    Raises UsageError for settings that differ from those of examples already there, InputError for a bad scene file.
+    Raises UsageError for settings or a scene that differ from those of examples already there, InputError for a bad
+    scene file.
     """
     _check(options)
     seeds = range(options.seed, options.seed + options.count)
-    missing = [seed for seed in seeds if not _is_complete(options, seed)]
+    digest = scene_digest(options.scene) if options.scene is not None else None
+    missing = [seed for seed in seeds if not _is_complete(options, seed, digest)]
     with make_progress(progress_kind, len(missing)) as progress:
         if len(missing) < len(seeds):
             progress.note(f"{len(seeds) - len(missing)} of {len(seeds)} examples are there already")
@@ -116,7 +126,7 @@ def render_scenes(options: RenderOptions, progress_kind: ProgressKind = "auto",
 
             done = run_frames(missing, work, progress, lambda seed: example_stem(options.outdir, seed).name,
                               here=workers <= 1)
-    complete = [example_stem(options.outdir, seed) for seed in seeds if _is_complete(options, seed)]
+    complete = [example_stem(options.outdir, seed) for seed in seeds if _is_complete(options, seed, digest)]
     if options.contact_sheet and complete:
         write_contact_sheet(options.outdir / CONTACT_SHEET, complete)
     return done
@@ -139,16 +149,20 @@ def _check(options: RenderOptions) -> None:
     options.outdir.mkdir(parents=True, exist_ok=True)
 
 
-def _is_complete(options: RenderOptions, seed: int) -> bool:
-    """Whether the example is there. Raises UsageError when it is, but rendered otherwise."""
+def _is_complete(options: RenderOptions, seed: int, digest: str | None) -> bool:
+    """Whether the example is there. Raises UsageError when it is, but rendered otherwise, or of a scene file of another
+    `digest`; an example that names none has that of its scene file's name."""
     *_, about_path = files = example_files(example_stem(options.outdir, seed))
     if not all(path.exists() for path in files):
         return False
     try:
         about: dict[str, Any] = json.loads(about_path.read_text())
-        rendered = about.get("scene"), about.get("settings")
+        rendered, rendered_of = (about.get("scene"), about.get("settings")), about.get("scene_digest", digest)
     except (ValueError, AttributeError) as error:
         raise InputError(f"{about_path}: is not an example's JSON; delete it to render the example again") from error
     if rendered != (options.scene and options.scene.name, asdict(options.settings)):
         raise UsageError(f"{about_path}: was rendered with other settings; choose another folder or other seeds")
+    if rendered_of != digest:
+        raise UsageError(f"{about_path}: was rendered of {options.scene} before that changed, or of another file of "
+                         f"its name; choose another folder or other seeds")
     return True

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -20,8 +20,8 @@ from pipelines.training.caching import build_cache, scene_files
 from pipelines.training.drawing import can_draw
 from pipelines.training.group import Group, joined
 from pipelines.training.loop import Trainer
-from pipelines.training.recipe import Recipe
-from pipelines.training.run_folder import RunFolder
+from pipelines.training.recipe import Recipe, differences
+from pipelines.training.run_folder import RunFolder, read_checkpoint
 
 FEWEST_SCENES, FEWEST_VALIDATION_SCENES = 2, 1
 
@@ -32,8 +32,8 @@ class TrainOptions:
 
     data, validation : folders of NAME.deep.exr with NAME.ref.exr
     out : folder of the run, see run_folder.py; a checkpoint in it is resumed
-    network : a name of model.config.CONFIGS; None: that of `start`, or fast
-    start : weight file, or a preset's name, to start from instead of random weights
+    network : a name of model.config.CONFIGS; None: that of the checkpoint, or of `start`, or fast
+    start : weight file, or a preset's name, to start from instead of random weights; of no use to a run that resumes
     cache : folder for the decoded data; None: beside each data folder, see cache_beside
     device : auto, cpu or cuda
     threads : of each process; None leaves PyTorch's choice
@@ -56,20 +56,20 @@ class TrainOptions:
     save_every: float = 600.0
 
 
-def train(options: TrainOptions, report: Callable[[str], None] = print) -> Path:
-    """Trains and returns the path of the weight file; under torchrun, one of its processes.
+def train(options: TrainOptions, report: Callable[[str], None] = print) -> Path | None:
+    """Trains and returns the path of the weight file, None where `seconds` ended the run before its last step; under
+    torchrun, one of its processes.
 
     Raises InputError and UsageError, naming the file, for data, weights and checkpoints that cannot be used, before
     training starts; StoppedError after SIGINT and SIGTERM, with a checkpoint written.
     """
-    config = network_of(options)
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     with joined(options.device) as group:
-        return _train(options, config, group, report)
+        return _train(options, group, report)
 
 
-def _train(options: TrainOptions, config: Config, group: Group, report: Callable[[str], None]) -> Path:
+def _train(options: TrainOptions, group: Group, report: Callable[[str], None]) -> Path | None:
     """One process's part. A function of its own: what holds on to the group is gone before the group is."""
     recipe = options.recipe
 
@@ -77,14 +77,18 @@ def _train(options: TrainOptions, config: Config, group: Group, report: Callable
         if group.leads:
             report(text)
 
-    group.first(lambda: _prepare(options, config, group, say))
+    group.first(lambda: _prepare(options, group, say))
     training, held_out = (SampleCache(folder) for folder in cache_folders(options))
+    config = network_of(options)
     start = starting_weights(options.start, config) if options.start is not None else None
     trainer = Trainer(config, recipe, options.out, start, group)
     say(f"{len(training.entries)} scenes, {len(held_out.entries)} held out, crops of "
         f"{crop_size(training.entries, recipe)} pixels, {group.size} process{'es'[:2 * (group.size > 1)]} on "
         f"{group.device.type}, from step {trainer.step}")
     trainer.run(training, held_out, say, options.seconds, options.save_every, options.loaders)
+    if trainer.step < recipe.steps:
+        say(f"stopped at step {trainer.step} of {recipe.steps}; the same command goes on")
+        return None
     info = {
         "description": f"{config.name}, trained by lbmc train",
         "data": {"scenes": len(training.entries), "validation": len(held_out.entries)},
@@ -98,8 +102,9 @@ def _train(options: TrainOptions, config: Config, group: Group, report: Callable
     return path
 
 
-def _prepare(options: TrainOptions, config: Config, group: Group, report: Callable[[str], None]) -> None:
+def _prepare(options: TrainOptions, group: Group, report: Callable[[str], None]) -> None:
     """Everything that can be refused, cheapest first; then the caches."""
+    config = network_of(options)
     if options.recipe.batch < group.size:
         raise UsageError(f"a batch of {options.recipe.batch} crops for {group.size} processes; raise --batch or start "
                          f"fewer")
@@ -110,11 +115,13 @@ def _prepare(options: TrainOptions, config: Config, group: Group, report: Callab
                          f"nothing about others, so name a folder of other scenes")
     if options.start is not None:
         starting_weights(options.start, config)
-    RunFolder(options.out, config, options.recipe).read(torch.device("cpu"))
+    folder = RunFolder(options.out, config, options.recipe)
+    folder.read(torch.device("cpu"))
+    folder.require_room()
     if not can_draw():
         report("curve.png and panels are not drawn: install lbmc with its extra 'train'")
-    for source, folder in zip((options.data, options.validation), cache_folders(options), strict=True):
-        build_cache(source, folder, report, options.threads)
+    for source, cache in zip((options.data, options.validation), cache_folders(options), strict=True):
+        build_cache(source, cache, report, options.threads)
 
 
 def cache_folders(options: TrainOptions) -> tuple[Path, Path]:
@@ -136,8 +143,12 @@ def open_cache(source: Path, report: Callable[[str], None]) -> SampleCache:
 
 
 def network_of(options: TrainOptions) -> Config:
-    """The network to train. Raises UsageError where there is none of that name, or no weights to take it from."""
+    """The network to train. Raises UsageError where there is none of that name, or no weights to take it from, and what
+    `read_checkpoint` does."""
     if options.network is None:
+        found = read_checkpoint(options.out, torch.device("cpu"))
+        if found is not None:
+            return found.config
         return FAST if options.start is None else _found(options.start).config
     if options.network not in CONFIGS:
         raise UsageError(f"--network {options.network}: there are {', '.join(CONFIGS)}")
@@ -147,9 +158,11 @@ def network_of(options: TrainOptions) -> Config:
 def starting_weights(path: Path, config: Config) -> dict[str, Tensor]:
     """The weights of a file. Raises UsageError where it is none, or of another network than `config`."""
     weights = _found(path)
-    if replace(weights.config, name=config.name) != config:
-        raise UsageError(f"--start: {path}: its network, {weights.config.name!r}, is not the {config.name!r} of "
-                         f"--network; without --network the file's is trained")
+    changed = [name for name in differences(config.to_dict(), weights.config.to_dict()) if name != "name"]
+    if changed:
+        raise UsageError(f"--start: {path}: its network, {weights.config.name!r}, differs from the {config.name!r} to "
+                         f"be trained in {', '.join(changed)}; without --network, into a new folder, the file's is "
+                         f"trained")
     try:
         return weights.load().state_dict()
     except ValueError as error:

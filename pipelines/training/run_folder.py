@@ -11,10 +11,13 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import pickle
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import torch
@@ -43,12 +46,33 @@ class State:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a checkpoint holds: the state, and the state dicts of network, average and optimizer."""
+    """What a checkpoint holds: network and recipe, the state, and the state dicts of network, average and optimizer."""
 
+    config: Config
+    recipe: dict[str, Any]
     state: State
     net: dict[str, Any]
     averaged: dict[str, Any]
     optimizer: dict[str, Any]
+
+
+def read_checkpoint(folder: Path, device: torch.device) -> Checkpoint | None:
+    """The checkpoint of a run's folder, if there is one. Raises InputError where it is broken, UsageError for a file in
+    the folder's place."""
+    path = folder / CHECKPOINT
+    # os.path takes what cannot even be asked for as absent; require_room says why
+    if os.path.exists(folder) and not os.path.isdir(folder):
+        raise UsageError(f"{folder}: is a file; name a folder for the run")
+    if not os.path.exists(path):
+        return None
+    try:
+        data = torch.load(path, map_location=device, weights_only=True)
+        return Checkpoint(Config.from_dict(json.loads(data["config"])), json.loads(data["recipe"]),
+                          State(data["step"], data["rows"], data["losses"]), data["net"], data["averaged"],
+                          data["optimizer"])
+    except (OSError, RuntimeError, EOFError, KeyError, ValueError, TypeError, pickle.UnpicklingError) as error:
+        raise InputError(f"{path}: not a checkpoint of this lbmc ({type(error).__name__}); train into another "
+                         f"folder") from None
 
 
 class RunFolder:
@@ -62,28 +86,36 @@ class RunFolder:
 
         Raises InputError where it is broken, UsageError where it is of another network or recipe.
         """
-        path = self.folder / CHECKPOINT
-        if self.folder.exists() and not self.folder.is_dir():
-            raise UsageError(f"{self.folder}: is a file; name a folder for the run")
-        if not path.exists():
+        found = read_checkpoint(self.folder, device)
+        if found is None:
             return None
-        try:
-            data = torch.load(path, map_location=device, weights_only=True)
-            config, recipe = Config.from_dict(json.loads(data["config"])), json.loads(data["recipe"])
-            found = Checkpoint(State(data["step"], data["rows"], data["losses"]), data["net"], data["averaged"],
-                               data["optimizer"])
-        except (OSError, RuntimeError, EOFError, KeyError, ValueError, TypeError, pickle.UnpicklingError) as error:
-            raise InputError(f"{path}: not a checkpoint of this lbmc ({type(error).__name__}); train into another "
-                             f"folder") from None
-        if config != self.config:
-            raise UsageError(f"{path}: its network, {config.name!r}, is not the {self.config.name!r} of "
-                             f"--network; train into another folder")
+        path = self.folder / CHECKPOINT
+        changed = list(differences(self.config.to_dict(), found.config.to_dict()))
+        if changed:
+            raise UsageError(f"{path}: its network, {found.config.name!r}, differs from the {self.config.name!r} of "
+                             f"--network in {', '.join(changed)}; train into another folder, or go on without "
+                             f"--network")
         # a field that a recipe does not name, since lbmc had it later, has its default
-        changed = list(differences(self.recipe.to_dict(), {**Recipe().to_dict(), **recipe}))
+        changed = list(differences(self.recipe.to_dict(), {**Recipe().to_dict(), **found.recipe}))
         if changed:
             raise UsageError(f"{path}: was made by another recipe (differs in {', '.join(changed)}); train into "
                              f"another folder, or go on with --recipe {self.folder / RECIPE}")
         return found
+
+    def require_room(self) -> None:
+        """Makes the folder, writes into it, and takes both back. Raises InputError where that cannot be done."""
+        missing = [folder for folder in (self.folder, *self.folder.parents) if not os.path.exists(folder)]
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with TemporaryFile(dir=self.folder):
+                pass
+        except OSError as error:
+            raise InputError(f"{self.folder}: cannot be written to ({error.strerror}); name another folder for the "
+                             f"run") from None
+        finally:
+            for folder in missing:
+                with suppress(OSError):
+                    folder.rmdir()
 
     def write(self, state: State, net: Denoiser, averaged: Denoiser, optimizer: Optimizer) -> None:
         """Recipe, checkpoint and curve."""

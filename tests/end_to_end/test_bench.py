@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -238,3 +239,13 @@ def test_two_models_of_one_name_are_refused(folder: Path, weights: Path, tmp_pat
     run = in_process("bench", folder, "--out", tmp_path / "out", "--model", weights, "--model",
                      tmp_path / weights.name)
     assert_one_line(run, "tiny.safetensors", "rename")
+
+
+def test_without_pillow_nothing_is_made(
+    folder: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    run = in_process("bench", folder, "--out", tmp_path / "out", "--model", weights, *QUICK)
+    assert run.code == 2
+    assert "need Pillow: install lbmc with its extra 'bench'" in run.err
+    assert not list(tmp_path.iterdir())

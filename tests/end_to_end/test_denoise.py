@@ -9,6 +9,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,8 @@ import pytest
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from deep_io import Window
+from deep_io import Header, Window
+from deep_io.deep_writer import DeepWriter
 from pipelines import __version__
 from tests.end_to_end.scenes import (
     WINDOW,
@@ -327,6 +329,51 @@ def test_a_dry_run_says_everything_and_writes_nothing(weights: Path, tmp_path: P
     run = in_process("denoise", source, tmp_path / "out.exr", "--model", weights, "--dry-run", "--keep", "lens")
     assert "kept as pixel means: lens.X lens.Y" in run.out
     assert run.out.startswith(f"{source} -> {tmp_path / 'out.exr'}\n")
+
+
+def test_a_dry_run_calls_no_channel_unused_that_is_asked_for(weights: Path, tmp_path: Path) -> None:
+    samples = noisy_scene(0, TINY)
+    more = {name: np.ones(samples.total, kind) for name, kind in
+            (("fog", np.float16), ("haze", np.float16), ("id", np.uint32), ("mist", np.float16))}
+    source = write_scene(tmp_path / "in.exr", changed(samples, **more))
+    words = ("denoise", source, tmp_path / "out.exr", "--model", weights, "--dry-run")
+
+    def unused(*asked: str) -> list[str]:
+        run = in_process(*words, *asked)
+        assert run.code == 0, run.err
+        return next(line.split()[1:] for line in run.out.splitlines() if line.startswith("  unused"))
+
+    assert unused() == ["fog", "haze", "id", "mist"]
+    assert unused("--aov", "fog", "--keep", "haze", "--ids", "id") == ["mist"]
+
+
+def test_a_reader_that_leaves_a_dry_run_fails_no_frame(weights: Path, tmp_path: Path) -> None:
+    for number in (1, 2, 3):
+        write_scene(tmp_path / f"in.{number}.exr", noisy_scene(number, TINY))
+    command = [LBMC, "denoise", tmp_path / "in.#.exr", tmp_path / "out.#.exr", "--model", weights, "--dry-run",
+               "--progress", "none"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment()) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+
+
+def test_a_part_is_chosen_by_name_before_number(weights: Path, tmp_path: Path) -> None:
+    scenes = [noisy_scene(number, TINY) for number in (1, 2)]
+    headers = [replace(Header.of_samples(scene), name=name) for scene, name in zip(scenes, "10", strict=True)]
+    with DeepWriter(tmp_path / "in.exr", headers) as writer:
+        for number, scene in enumerate(scenes):
+            writer.write(scene, number)
+    write_scene(tmp_path / "first.exr", scenes[0])
+    words = ("--model", weights)
+    assert in_process("denoise", tmp_path / "in.exr", tmp_path / "out.exr", "--part", "1", *words).code == 0
+    assert in_process("denoise", tmp_path / "first.exr", tmp_path / "alone.exr", *words).code == 0
+    assert np.array_equal(rgb(tmp_path / "out.exr"), rgb(tmp_path / "alone.exr"))
+    for command in (("denoise", tmp_path / "in.exr", tmp_path / "no.exr", *words), ("info", tmp_path / "in.exr")):
+        run = in_process(*command, "--part", "\u00b2")
+        assert run.code == 3
+        assert "has no part '\u00b2'; its parts are 1, 0" in run.err
 
 
 def test_a_gpu_that_is_not_there_is_a_usage_error(weights: Path, tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ def all_options() -> set[str]:
 
 def own_text(page: Path) -> str:
     """The page without the lines that call other programs, whose options are theirs."""
-    lines = page.read_text("utf-8").splitlines()
+    lines = page.read_text("utf-8").replace("\\\n", "").splitlines()
     return "\n".join(line for line in lines if not any(f"{name}" in line for name in OTHER_PROGRAMS))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 from deep_io import DeepSamples, Window, read_deep, read_headers
 from pipelines.ids import cryptomatte_hash
+from pipelines.options import COMPRESSIONS, LOSSY_FOR_FLOATS
 from tests.end_to_end.compositor import picture
 from tests.end_to_end.scenes import noisy_scene, random_weights, read_flat, write_scene
 from tests.runner import in_process
@@ -129,6 +131,75 @@ def test_ids_go_with_the_beauty_of_the_flat_forms(weights: Path, source: Path, t
     refused = in_process("export-layers", source, tmp_path / "deep.exr", "--model", weights, "--ids", "id")
     assert refused.code == 2
     assert "--form parts" in refused.err
+
+
+@pytest.mark.parametrize("command", [("denoise",), ("export-layers", "--form", "channels")], ids=" ".join)
+def test_no_compression_that_is_taken_with_ids_changes_one_of_their_bits(
+    command: tuple[str, ...], weights: Path, source: Path, tmp_path: Path
+) -> None:
+    words = (*command, source, tmp_path / "out.exr", "--model", weights, "--ids", "id", "--overwrite", "--compression")
+    found: dict[str, dict[str, bytes]] = {}
+    for compression in COMPRESSIONS:
+        run = in_process(*words, compression)
+        if compression in LOSSY_FOR_FLOATS:
+            assert run.code == 2
+            assert re.fullmatch(rf"ERROR: --ids: compression {compression} .*; choose one of none, .*\n", run.err)
+            continue
+        assert run.code == 0, run.err
+        channels, _ = read_flat(tmp_path / "out.exr")
+        found[compression] = {name: plane.tobytes() for name, plane in channels.items() if name.startswith("id0")}
+    assert all(len(planes) == 12 and planes == found["none"] for planes in found.values())
+
+
+def test_ids_whose_names_are_alike_are_all_written(weights: Path, tmp_path: Path) -> None:
+    samples = noisy_scene(5, WINDOW)
+    names = ("inst1", "inst100", "inst10000.R")
+    for number, name in enumerate(names):
+        samples.channels[name] = np.full(samples.total, number, np.uint32)
+    source = write_scene(tmp_path / "in.exr", samples)
+    words = (word for name in names for word in ("--ids", name))
+    channels, _ = read_flat(lbmc("denoise", source, tmp_path / "out.exr", weights, *words))
+    for number, name in enumerate(("inst1", "inst100", "inst10000")):
+        ids = channels[f"{name}00.R"].view(np.uint32)
+        assert set(ids[channels[f"{name}00.G"] > 0].tolist()) == {cryptomatte_hash(str(number))}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--keep", "albedo", "--aov", "albedo"], "--keep albedo: albedo.B is written by --aov already; leave one of"),
+        (["--keep", "id00", "--ids", "id"], "--keep id00: id00.G is written by --ids id already; leave one of"),
+        (["--aov", "id00", "--ids", "id"], "id00.R would be written twice, by --aov and by --ids id; leave one of"),
+        (["--ids", "id", "--ids", "id.R"], "id00.R would be written twice, by --ids id and by --ids id.R; leave one"),
+    ],
+)
+def test_no_channel_is_written_twice(words: list[str], said: str, weights: Path, tmp_path: Path) -> None:
+    samples = scene_with_aovs()
+    samples.channels |= {"id00.R": samples.channels["fog"], "id00.G": samples.channels["fog"],
+                         "id.R": samples.channels["id"]}
+    source = write_scene(tmp_path / "in.exr", samples)
+    run = in_process("denoise", source, tmp_path / "out.exr", "--model", weights, *words)
+    assert run.code == 2, run.err
+    assert len([line for line in run.err.splitlines() if line.startswith("ERROR: ") and said in line]) == 1
+    assert list(tmp_path.iterdir()) == [source]
+
+
+def test_a_layers_own_channel_is_no_name_for_an_aov(weights: Path, tmp_path: Path) -> None:
+    samples = scene_with_aovs()
+    samples.channels["layer1.R"] = samples.channels["fog"]
+    source = write_scene(tmp_path / "in.exr", samples)
+    words = ("--model", weights, "--aov", "layer1.R")
+    refused = in_process("export-layers", source, tmp_path / "out.exr", *words, "--form", "channels")
+    assert refused.code == 2
+    assert "layer1.R would be written twice, by --aov and by the layers" in refused.err
+    lbmc("export-layers", source, tmp_path / "out.exr", weights, "--aov", "layer1.R", "--form", "parts")
+
+
+def test_a_glob_to_keep_passes_denoised_aovs_by(weights: Path, source: Path, tmp_path: Path) -> None:
+    out, _ = read_flat(lbmc("denoise", source, tmp_path / "out.exr", weights, "--aov", "albedo"))
+    both, _ = read_flat(lbmc("denoise", source, tmp_path / "both.exr", weights, "--aov", "albedo", "--keep", "*"))
+    assert {"N.X", "fog", "key.R"} < set(both)
+    assert all(np.array_equal(both[name], plane) for name, plane in out.items())
 
 
 @pytest.mark.parametrize("command", ["denoise", "export-layers"])

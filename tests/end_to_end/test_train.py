@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -20,6 +21,8 @@ from deep_io.flat import write_flat
 from model import zoo
 from model.config import FAST, OPTIMIZED
 from model.denoiser import Denoiser
+from pipelines.training.loop import Trainer
+from pipelines.training.recipe import Recipe, changed
 from tests.pipelines.training_data import SIZE, uneven, write_example
 from tests.runner import LBMC, environment, in_process
 
@@ -220,9 +223,12 @@ def test_weights_recipes_and_folders_that_do_not_fit_are_refused_before_training
     start = ("train", folder / "data", tmp_path / "run", "--validation", folder / "held", *QUICK)
     onto = ("train", folder / "data", folder / "whole", "--validation", folder / "held", *QUICK)
     cases = [
-        ((*start, "--network", "fast", "--start", other), "its network, 'optimized', is not the 'fast'"),
+        ((*start, "--network", "fast", "--start", other), "its network, 'optimized', differs from the 'fast' to be "
+                                                          "trained in unet.encoder, "),
+        ((*onto, "--start", other), "its network, 'optimized', differs from the 'fast' to be trained in unet.enc"),
         ((*start, "--start", tmp_path / "none.safetensors"), "none.safetensors: no such weight file"),
-        ((*onto, "--network", "optimized"), "whole/checkpoint.pt: its network, 'fast', is not the 'optimized'"),
+        ((*onto, "--network", "optimized"), "whole/checkpoint.pt: its network, 'fast', differs from the 'optimized' of "
+                                         "--network in name, unet.encoder, "),
         ((*onto, "--seed", 5), "whole/checkpoint.pt: was made by another recipe (differs in seed)"),
         ((*start, "--network", "huge"), "--network huge: there are layer"),
         ((*start, "--set", "warmpu=3"), "no field warmpu"),
@@ -245,3 +251,38 @@ def test_without_a_network_named_that_of_the_starting_weights_is_trained(folder:
                       "--start", tmp_path / "mine.safetensors")
     assert done.code == 0, done.err
     assert zoo.find(str(tmp_path / "run" / "mine.safetensors")).config == mine
+
+
+def test_a_run_of_a_network_that_has_changed_since_goes_on_with_its_own(folder: Path, tmp_path: Path) -> None:
+    older = replace(FAST, affinity_features=4, filtered_guides=False)
+    words = ("train", folder / "data", tmp_path, "--validation", folder / "held", "--steps", 2, *QUICK[2:])
+    recipe = changed(Recipe(), ["steps=2", "validate_every=2", "batch=3", "crop=32", "warmup=1", "bfloat16=false"])
+    Trainer(older, recipe, tmp_path).save()
+    refused = in_process(*words, "--network", "fast")
+    assert refused.code == 2
+    assert re.fullmatch(r"ERROR: .*checkpoint.pt: its network, 'fast', differs from the 'fast' of --network in "
+                        r"affinity_features, filtered_guides; .*or go on without --network\n", refused.err)
+    done = in_process(*words)
+    assert done.code == 0, done.err
+    assert zoo.find(str(tmp_path / "fast.safetensors")).config == older
+
+
+def test_a_run_that_is_out_of_time_says_so_and_has_no_weights_yet(folder: Path, tmp_path: Path) -> None:
+    words = ("train", folder / "data", tmp_path / "run", "--validation", folder / "held", *QUICK)
+    done = in_process(*words, "--seconds", 1e-9)
+    assert done.code == 0, done.err
+    assert done.out.splitlines()[-1] == f"stopped at step 0 of {STEPS}; the same command goes on"
+    assert not list((tmp_path / "run").glob("*.safetensors"))
+    assert step_of(tmp_path, "run") == 0
+
+
+@pytest.mark.parametrize("out", ["file/run", "x" * 300, "there/" + "x" * 300])
+def test_a_folder_that_cannot_be_written_to_is_refused_before_the_data_are_read(
+    out: str, folder: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    done = in_process("train", folder / "data", tmp_path / out, "--validation", folder / "held", *QUICK,
+                      "--cache", tmp_path / "cache")
+    assert done.code == 3
+    assert re.fullmatch(r"ERROR: .*: cannot be written to \(.*\); name another folder for the run\n", done.err)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

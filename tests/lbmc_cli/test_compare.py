@@ -190,3 +190,28 @@ def test_sequences_without_a_common_frame_are_refused(sequences: Path) -> None:
     run = in_process("compare", sequences / "image.####.exr", sequences / "else.####.exr")
     assert run.code == 3
     assert "no frame in common" in run.err
+
+
+@pytest.mark.parametrize("debug", [False, True])
+def test_a_pair_that_cannot_be_compared_is_one_line_and_with_debug_a_traceback(
+    debug: bool, pair: tuple[Path, Path], tmp_path: Path
+) -> None:
+    small = write_flat(tmp_path / "small.exr", picture(0)[:5])
+    run = in_process("compare", small, pair[1], *["--debug"] * debug)
+    assert run.code == 3
+    assert run.err.startswith("ERROR: ")
+    assert ("Traceback" in run.err) == debug
+    assert debug or run.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(("words", "env"), [(("--progress", "openjd"), {}), ((), {"LBMC_PROGRESS": "openjd"})])
+def test_json_is_json_also_where_open_job_description_is_told(
+    words: tuple[str, ...], env: dict[str, str], lbmc: Runner, tmp_path: Path
+) -> None:
+    for number in (1, 2):
+        write_flat(tmp_path / f"a.{number}.exr", picture(number))
+        write_flat(tmp_path / f"b.{number}.exr", picture(number + 2))
+    run = lbmc("compare", tmp_path / "a.#.exr", tmp_path / "b.#.exr", "--no-flip", "--json", *words, env=env)
+    assert run.code == 0, run.err
+    assert len(json.loads(run.out)["images"]) == 2
+    assert "openjd_progress: 100" in run.err.splitlines()

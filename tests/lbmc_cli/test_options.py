@@ -8,6 +8,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
+from deep_io.sequences import Frame
 from lbmc_cli.main import lbmc as program
 from lbmc_cli.options import ByteSize, Device
 from pipelines.options import DenoiseOptions
@@ -24,7 +25,7 @@ def parsed(monkeypatch: pytest.MonkeyPatch) -> Any:
         import pipelines.frames
         from pipelines.jobs import JobReport
 
-        def catch(options: DenoiseOptions) -> JobReport[None]:
+        def catch(options: DenoiseOptions, frames: list[Frame]) -> JobReport[None]:
             caught.append(options)
             return JobReport(())
 
@@ -54,7 +55,7 @@ def test_every_flag_reaches_its_option(parsed: Any) -> None:
         frames="1-5",
         existing="skip",
         force=True,
-        part=1,
+        part="1",
         overrides={"normal": "Nw", "depth": "Zc"},
         weighting="over",
         normals="world",
@@ -88,7 +89,33 @@ def test_environment_variables_stand_in_for_flags(parsed: Any) -> None:
     assert not parsed(env={"LBMC_NO_ADAPT": "1"}).adapt
     assert parsed(env={"LBMC_NO_ADAPT": "0"}).adapt
     assert parsed(env={"LBMC_KEEP": "albedo"}).keep == ("albedo",)
-    assert parsed(env={"LBMC_MAP": "normal=Nw depth=Zc"}).overrides == {"normal": "Nw", "depth": "Zc"}
+
+
+def test_a_variable_of_a_repeatable_option_holds_a_value_a_line(parsed: Any) -> None:
+    assert parsed(env={"LBMC_MAP": "normal=Denoising Normal"}).overrides == {"normal": "Denoising Normal"}
+    two = parsed(env={"LBMC_MAP": "normal=N w\n\n depth=Zc\n", "LBMC_KEEP": "light *\nfog"})
+    assert two.overrides == {"normal": "N w", "depth": "Zc"}
+    assert two.keep == ("light *", "fog")
+
+
+def test_a_flag_wins_over_the_variable_of_one_that_excludes_it(parsed: Any) -> None:
+    assert parsed("--skip-existing", env={"LBMC_OVERWRITE": "1"}).existing == "skip"
+    assert parsed("--overwrite", env={"LBMC_DENOISE_SKIP_EXISTING": "1"}).existing == "overwrite"
+    fixed = parsed("--exposure", "2", env={"LBMC_EXPOSURE_FROM": "1001"})
+    assert (fixed.exposure, fixed.exposure_from) == (2.0, None)
+    named = parsed("--exposure-from", "1001", env={"LBMC_EXPOSURE": "2"})
+    assert (named.exposure, named.exposure_from) == (None, "1001")
+    run = in_process("denoise", "in.exr", "out.exr", env={"LBMC_OVERWRITE": "1", "LBMC_SKIP_EXISTING": "1"})
+    assert run.code == 2
+    assert "exclude each other" in run.err
+
+
+def test_samples_win_over_variables_of_what_they_exclude() -> None:
+    env = {"LBMC_FORM": "parts", "LBMC_AOV": "key", "LBMC_IDS": "id", "LBMC_CONTRIBUTIONS": "1"}
+    run = in_process("export-layers", "absent.exr", "out.exr", "--samples", env=env)
+    assert run.code == 3, run.err
+    assert "absent.exr: no such file" in run.err
+    assert in_process("export-layers", "absent.exr", "out.exr", env={**env, "LBMC_SAMPLES": "1"}).code == 2
 
 
 @pytest.mark.parametrize(
@@ -122,6 +149,7 @@ def test_what_is_not_a_device_is_refused(text: str) -> None:
         (["--exposure", "0"], "exposure"),
         (["--memory", "much"], "2GiB"),
         (["--layers", "0"], "from 1 to 5"),
+        (["--layers", "\u00b2"], "from 1 to 5"),
     ],
 )
 def test_wrong_values_are_usage_errors_that_say_what_is_right(arguments: list[str], word: str) -> None:

@@ -115,3 +115,27 @@ def test_the_first_frame_decides_and_a_later_one_that_differs_is_told_once(tmp_p
                        "--exposure-from", "1")
     assert alone.code == 0, alone.err
     assert (tmp_path / "late.0003.exr").read_bytes() == (tmp_path / "out.0003.exr").read_bytes()
+
+
+def without(samples: DeepSamples, *layers: str) -> DeepSamples:
+    kept = {name: values for name, values in samples.channels.items() if name.partition(".")[0] not in layers}
+    return DeepSamples(samples.counts, kept, samples.window)
+
+
+def test_a_role_that_only_one_of_a_frame_and_the_deciding_one_has_is_told_once(tmp_path: Path) -> None:
+    weights = random_weights(tmp_path / "w.safetensors")
+    scene = noisy_scene(0)
+    for number, missing in ((1, ("roughness",)), (2, ("albedo", "N", "roughness")), (3, ("albedo",)), (4, ("Z",))):
+        write_scene(tmp_path / f"in.{number}.exr", without(scene, *missing))
+    words = ("denoise", tmp_path / "in.#.exr", "--model", weights)
+    run = in_process(*words, tmp_path / "out.#.exr")
+    assert run.code == 0, run.err
+    told = [line for line in run.err.splitlines() if "the frame that decided for the shot" in line]
+    assert [line.partition(", which")[0] for line in told] == [
+        f"{tmp_path}/in.2.exr: lacks normal, albedo", f"{tmp_path}/in.3.exr: has roughness",
+        f"{tmp_path}/in.4.exr: lacks depth"]
+    assert "--map normal=none --map albedo=none" in told[0]
+    chunk = in_process(*words, tmp_path / "chunk.#.exr", "--frames", "3", "--exposure-from", "1")
+    assert "in.3.exr: lacks albedo" in chunk.err
+    drop = (word for role in ("normal", "albedo", "roughness", "depth") for word in ("--map", f"{role}=none"))
+    assert "decided for the shot" not in in_process(*words, tmp_path / "less.#.exr", *drop).err

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,7 +14,7 @@ from model.denoiser import Denoiser
 from pipelines.frame_context import strips
 from pipelines.frame_reader import FrameReader
 from pipelines.plan import fit
-from pipelines.tiles import Band, FrameLoad, plan_bands, within_reach
+from pipelines.tiles import DEFAULT_MEMORY, Band, FrameLoad, default_memory, plan_bands, within_reach
 from tests.end_to_end.scenes import noisy_scene, write_scene
 from tests.model.random_models import SMALL
 
@@ -106,3 +107,33 @@ def test_all_that_busy_rows_see_is_within_reach(busy: list[bool], reach: int, st
     seen = {row for k, one in enumerate(busy) if one for row in range(max(k - reach, 0), min(k + reach + 1, len(busy)))}
     assert seen <= set(range(first, last))
     assert bool(seen) == (last > first)
+
+
+@pytest.mark.parametrize(
+    ("groups", "limits", "expected"),
+    [
+        ("0::/", {}, DEFAULT_MEMORY),
+        ("0::/", {"memory.max": "max\n"}, DEFAULT_MEMORY),
+        ("0::/", {"memory.max": f"{6 << 30}\n"}, 3 << 30),
+        ("0::/slice/job:1", {"slice/memory.max": f"{4 << 30}\n", "slice/job:1/memory.max": "max\n"}, 2 << 30),
+        ("0::/slice/job:1", {"slice/memory.max": f"{4 << 30}\n", "slice/job:1/memory.max": f"{2 << 30}\n"}, 1 << 30),
+        ("0::/slice/job:1", {"other/memory.max": f"{1 << 30}\n"}, DEFAULT_MEMORY),
+        ("0::/not/in/this/container", {"memory.max": f"{2 << 30}\n"}, 1 << 30),
+        ("3:cpu,cpuacct:/x\n2:memory:/job\n0::/", {"memory/job/memory.limit_in_bytes": f"{2 << 30}\n",
+                                                    "memory/memory.limit_in_bytes": "9223372036854771712\n"}, 1 << 30),
+        ("2:memory:/job", {"memory/job/memory.limit_in_bytes": "9223372036854771712\n"}, DEFAULT_MEMORY),
+        ("3:cpu,cpuacct:/x\n2:memory:/job", {"memory/x/memory.limit_in_bytes": f"{2 << 30}\n"}, DEFAULT_MEMORY),
+    ],
+)
+def test_the_budget_is_half_of_the_least_limit_of_the_control_groups_around_the_process(
+    groups: str, limits: dict[str, str], expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("os.sysconf", {"SC_PAGE_SIZE": 1, "SC_PHYS_PAGES": 1 << 40}.__getitem__)
+    for name, text in {"proc/self/cgroup": groups, **{f"sys/fs/cgroup/{key}": v for key, v in limits.items()}}.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert default_memory(tmp_path) == expected
+
+
+def test_a_machine_without_control_groups_has_a_budget(tmp_path: Path) -> None:
+    assert 0 < default_memory(tmp_path) <= DEFAULT_MEMORY

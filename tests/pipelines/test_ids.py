@@ -13,7 +13,8 @@ from pipelines.ids import RANKS, IdChannel, cryptomatte_hash, find_ids, rank
 from tests.deep_io.oracles import seeded
 
 HEADER = Header(channels_of({"R": np.float16, "id": np.uint32, "object.id": np.uint32, "crypto00.R": np.float32,
-                             "crypto00.G": np.float32, "half_id": np.float16}), Window(0, 0, 1, 1), Window(0, 0, 1, 1))
+                             "crypto00.G": np.float32, "half_id": np.float16, "id100": np.uint32,
+                             "hash100": np.float32, "n00.R": np.uint32}), Window(0, 0, 1, 1), Window(0, 0, 1, 1))
 
 
 @pytest.mark.parametrize(
@@ -65,13 +66,20 @@ def test_ranked_weights_are_the_sums_of_each_id(samples: list[tuple[int, int, fl
         ("object", IdChannel("object.id", "object", False)),
         ("crypto", IdChannel("crypto00.R", "crypto", True)),
         ("crypto00.R", IdChannel("crypto00.R", "crypto", True)),
+        ("id100", IdChannel("id100", "id100", False)),
+        ("hash100", IdChannel("hash100", "hash100", True)),
+        ("n00", IdChannel("n00.R", "n00", False)),
     ],
 )
 def test_id_channels_are_found_by_channel_layer_or_cryptomatte(name: str, expected: IdChannel) -> None:
     assert find_ids([name, name], HEADER, "in.exr") == [expected]
 
 
-@pytest.mark.parametrize(("name", "said"), [("nothing", "id, object.id"), ("half_id", "half")])
+def test_a_cryptomatte_named_twice_is_written_once() -> None:
+    assert find_ids(["crypto", "crypto00.R"], HEADER, "in.exr") == [IdChannel("crypto00.R", "crypto", True)]
+
+
+@pytest.mark.parametrize(("name", "said"), [("nothing", "id, id100, n00.R, object.id"), ("half_id", "half")])
 def test_what_cannot_hold_ids_is_refused(name: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         find_ids([name], HEADER, "in.exr")

@@ -65,6 +65,21 @@ def test_an_interrupt_ends_the_job() -> None:
         run({1: "a", 2: KeyboardInterrupt(), 3: "c"})
 
 
+def test_a_reader_that_left_ends_the_job_and_fails_no_frame(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(BrokenPipeError):
+        run({1: "a", 2: BrokenPipeError(), 3: "c"})
+    assert capsys.readouterr().err == ""
+
+
+def test_the_cure_for_too_little_memory_is_the_jobs_own(capsys: pytest.CaptureFixture[str]) -> None:
+    def work(frame: int, progress: Progress) -> None:
+        raise MemoryError
+
+    (frame,) = run_frames([1], work, Progress(1), cure="take less").failed
+    assert capsys.readouterr().err == "ERROR: out of memory; take less\n"
+    assert frame.told == "out of memory; take less"
+
+
 def test_every_frame_is_timed_also_the_failed() -> None:
     report = run({1: "a", 2: InputError("x")})
     assert all(frame.seconds > 0.0 and frame.cpu_seconds >= 0.0 for frame in report.frames)
@@ -73,10 +88,10 @@ def test_every_frame_is_timed_also_the_failed() -> None:
 def test_errors_are_described_in_one_line() -> None:
     assert describe_error(InputError("a.exr:\nis flat")) == "a.exr: is flat"
     assert describe_error(PermissionError(13, "Permission denied", "b.exr")) == "b.exr: Permission denied"
-    assert "--memory" in describe_error(MemoryError())
+    assert describe_error(MemoryError()) == "out of memory; run on a machine with more"
     with pytest.raises(RuntimeError) as caught:
         torch.empty(1 << 52)
     for error in (caught.value, torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 9.00 GiB.")):
-        assert describe_error(error) == "out of memory; pass a smaller --memory, or run on a machine with more"
+        assert describe_error(error, "do this") == "out of memory; do this"
     assert "(unexpected" in describe_error(RuntimeError("mat1 and mat2 cannot be multiplied"))
     assert describe_error(KeyError("x")).startswith("KeyError: 'x' (unexpected")

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from pipelines.options import DenoiseOptions
+from pipelines.options import COMPRESSIONS, LOSSY_FOR_FLOATS, DenoiseOptions
 
 
 @pytest.mark.parametrize(
@@ -27,3 +27,13 @@ from pipelines.options import DenoiseOptions
 def test_values_out_of_range_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="|".join(wrong)):
         DenoiseOptions("in.exr", "out.exr", **wrong)
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_ids_are_refused_with_a_compression_that_changes_floats(compression: str) -> None:
+    assert DenoiseOptions("in.exr", "out.exr", compression=compression).ids == ()
+    if compression not in LOSSY_FOR_FLOATS:
+        assert DenoiseOptions("in.exr", "out.exr", compression=compression, ids=("id",)).compression == compression
+        return
+    with pytest.raises(ValueError, match=f"--ids: compression {compression} .* one of none, rle, .*, b44a$"):
+        DenoiseOptions("in.exr", "out.exr", compression=compression, ids=("id",))
