@@ -15,7 +15,7 @@ import numpy.typing as npt
 from deep_io.flat import HALF_MAX
 from model.metrics import EPSILON, common_scale, score
 from pipelines.rendering.patterns import join, make_pattern, shuffle_order
-from pipelines.rendering.tracer import EMISSION, TIME_BINS, SceneTracer
+from pipelines.rendering.tracer import EMISSION, SceneTracer
 from pipelines.rendering.views import COC_RANGE, View, add_camera_motion, add_defocus, choose_view, draw_object_motions
 
 Array = npt.NDArray[np.float32]
@@ -40,6 +40,7 @@ PILOT, PILOT_SAMPLES = 64, 16
 
 DEFOCUS_SHARE, MOTION_SHARE, STRATIFIED_SHARE, BLACK_SHARE = 0.5, 0.5, 0.5, 0.15
 OBJECTS_SHARE, BOTH_SHARE = 0.55, 0.25  # of the scenes with motion: objects move; objects and camera move
+TIME_BINS = (8, 16)  # one is drawn for a scene whose samples share times
 REFERENCE_PASS = 32
 JOINT_REFERENCE = 128  # up to here samples and reference of moving objects share one sweep over the shutter
 
@@ -142,7 +143,8 @@ def _expose(tracer: SceneTracer, view: View, black: bool, rng: np.random.Generat
     """Trace samples and reference, bring both to one exposure and put the samples in a fair order."""
     n, size = settings.samples, settings.size
     stratified = bool(rng.random() < STRATIFIED_SHARE)
-    channels, passes = _trace(tracer, view, stratified, rng, settings)
+    bins = draw_time_bins(view, rng)
+    channels, passes = _trace(tracer, view, stratified, bins, rng, settings)
     order = shuffle_order(rng, size**2, n)
     channels = {name: values[order] for name, values in channels.items()}
     broken = _clean(channels, black)
@@ -158,7 +160,7 @@ def _expose(tracer: SceneTracer, view: View, black: bool, rng: np.random.Generat
     reference = (total / settings.reference).astype(np.float32)
     about = tracer.describe() | {
         "settings": asdict(settings), "defocus": view.defocus, "camera_motion": view.camera_motion,
-        "object_motion": view.object_motion, "stratified": stratified, "black_background": black,
+        "object_motion": view.object_motion, "stratified": stratified, "time_bins": bins, "black_background": black,
         "brightness": brightness, "clamp": limit, "non_finite_paths": broken, **_measure(channels, reference, n)}
     return Shot(channels, reference, about)
 
@@ -175,14 +177,26 @@ def scale_and_cut(channels: dict[str, Array], scale: float, limit: float, bright
         channels[c] = np.minimum(light, HALF_MAX).astype(np.float32)
 
 
-def _trace(tracer: SceneTracer, view: View, stratified: bool, rng: np.random.Generator,
+def draw_time_bins(view: View, rng: np.random.Generator) -> int | None:
+    """How many times the samples of all pixels share, evenly over the shutter; None: each has its own.
+
+    Renderers that step through the shutter show what moves as often as they step, sharply. Objects move in steps
+    always, since each time rebuilds the scene; the camera alone in half of the scenes.
+    """
+    bins = int(rng.choice(TIME_BINS))
+    smooth = rng.random() < 0.5
+    if view.object_motion or (view.camera_motion and not smooth):
+        return bins
+    return None
+
+
+def _trace(tracer: SceneTracer, view: View, stratified: bool, bins: int | None, rng: np.random.Generator,
            settings: RenderSettings) -> tuple[dict[str, Array], Iterator[dict[str, Array]]]:
     """The samples' channels and, pass by pass as they are traced, the reference's R, G, B, EMISSION and A.
 
     All are (N,), pixel-major.
     """
     pixels, n, reference = settings.size**2, settings.samples, settings.reference
-    bins = TIME_BINS if tracer.moving else None
     seeds = [int(s) for s in rng.integers(2**31, size=2)]
     pattern = make_pattern(rng, pixels, n, stratified, bins)
     if tracer.moving and reference <= JOINT_REFERENCE:

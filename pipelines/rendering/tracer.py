@@ -23,7 +23,6 @@ from pipelines.rendering.patterns import Pattern
 Array = npt.NDArray[np.float32]
 Vector = npt.NDArray[np.float64]
 
-TIME_BINS = 16
 MAX_DEPTH = 5  # segments, so four bounces: a sixth cheaper than six, and hardly darker
 NO_ROULETTE = 1000
 # Transparent surfaces that a camera ray may cross; the next one counts as hit. The path itself reaches no further.
@@ -131,7 +130,7 @@ class SceneTracer(ABC):
 
     @property
     def moving(self) -> bool:
-        """Whether objects move, so that samples must come in TIME_BINS bins of shutter time."""
+        """Whether objects move, so that samples must share few times: each rebuilds the scene."""
         return bool(self._moving)
 
     def set_moving(self, meshes: list[MovingMesh]) -> None:
@@ -176,8 +175,8 @@ class SceneTracer(ABC):
         """The pattern's N = P * S paths, pixel-major: canonical channel name -> (N,), P = camera.size ** 2.
 
         `features` "coverage" gives R, G, B, EMISSION and A only. EMISSION is the part of R, G, B that
-        the surface or sky in view emits itself. When objects move, the pattern's times must be the centres of
-        TIME_BINS bins. `multijitter` stratifies the paths' own numbers too, where nothing moves.
+        the surface or sky in view emits itself. When objects move, every different time of the pattern rebuilds
+        the scene. `multijitter` stratifies the paths' own numbers too, where nothing moves.
         """
         pixels, samples = pattern.time.shape
         rig = CameraRig(self.mi, self.dr, camera)
@@ -193,14 +192,14 @@ class SceneTracer(ABC):
         return out
 
     def _launches(self, pattern: Pattern, multijitter: bool) -> Iterator[tuple[npt.NDArray[np.int64], float | None]]:
-        """Flat sample indices of each launch, with its time bin's centre when objects move."""
+        """Flat sample indices of each launch, with the time they share when objects move."""
         pixels, samples = pattern.time.shape
         if self.moving:
-            bins = np.floor(pattern.time.ravel() * TIME_BINS).astype(int)
-            for b in np.unique(bins):
-                index = np.nonzero(bins == b)[0]
+            times = pattern.time.ravel()
+            for time in np.unique(times):
+                index = np.nonzero(times == time)[0]
                 for start in range(0, len(index), LAUNCH):
-                    yield index[start:start + LAUNCH], (float(b) + 0.5) / TIME_BINS
+                    yield index[start:start + LAUNCH], float(time)
             return
         step = min(max(1, LAUNCH // pixels), MULTIJITTER if multijitter else samples)
         flat = np.arange(pixels * samples).reshape(pixels, samples)

@@ -61,21 +61,27 @@ def move(samples: Samples, device: torch.device) -> Samples:
 
 
 def take(arrays: SceneArrays, y: slice, x: slice, turn: Turn, count: int, share: float,
-         rng: np.random.Generator | None = None) -> Crop:
+         rng: np.random.Generator | None = None, even: bool = False) -> Crop:
     """A crop, turned, with `count` samples in every pixel; where pixels differ, with `share` of those each one has.
 
     Samples of a scene weighted by `over` are all taken: they only mean something together. Which others, is drawn
-    from `rng`; without one, the first. The directions in the values are still those of the file.
+    from `rng`; without one, the first. `even`: spread over the shutter instead, one in each of as many intervals; any
+    in its interval, or without `rng` the middle one. The directions in the values are still those of the file.
     """
     if arrays.offsets is not None:
         width = arrays.target.shape[1]
         rows = np.arange(y.start, y.stop)[:, None]
         pixels = turn.picture(rows * width + np.arange(x.start, x.stop)).ravel()
-        return _take_ragged(arrays, arrays.offsets, pixels, share, rng)
+        return _take_ragged(arrays, arrays.offsets, pixels, share, rng, even)
     held = arrays.samples.shape[2]
     first = 0 if rng is None else int(rng.integers(0, held))
     block = turn.picture(arrays.samples[y, x])
-    if first + count > held:  # samples lie in a circle
+    if even:
+        order = np.argsort(block[..., CHANNELS["time"].start], axis=2, kind="stable")
+        counts = np.full(order[..., 0].size, count)
+        picked = spread(np.full_like(counts, held), counts, rng).reshape(*order.shape[:2], count)
+        chosen = np.take_along_axis(block, np.take_along_axis(order, picked, 2)[..., None], 2)
+    elif first + count > held:  # samples lie in a circle
         chosen = block[:, :, (first + np.arange(count)) % held]
     else:
         chosen = block[:, :, first : first + count]
@@ -83,8 +89,28 @@ def take(arrays: SceneArrays, y: slice, x: slice, turn: Turn, count: int, share:
     return Crop(np.full(len(values) // count, count, np.int64), values, np.full(len(values), 1 / count, np.float32))
 
 
+def spread(held: IndexArray, counts: IndexArray, rng: np.random.Generator | None) -> IndexArray:
+    """(N,) ascending places: in each pixel `counts` (P,) of 0 .. `held` - 1 (P,), evenly spread, none twice.
+
+    One is drawn from each of `counts` intervals, whose bounds are drawn for each pixel; without `rng` its middle one.
+    """
+    step, number = np.repeat(held / np.maximum(counts, 1), counts), _within(counts)
+    shift = np.repeat(np.full(counts.size, 0.5) if rng is None else rng.random(counts.size), counts)
+    last = number == np.repeat(counts, counts) - 1
+    start = np.where(number == 0, 0, np.floor(number * step + shift)).astype(np.int64)
+    stop = np.where(last, np.repeat(held, counts), np.floor((number + 1) * step + shift)).astype(np.int64)
+    place = (0.5 if rng is None else rng.random(number.size)) * (stop - start)
+    return start + place.astype(np.int64)
+
+
+def _within(counts: IndexArray) -> IndexArray:
+    """(N,) 0, 1, ... `counts` - 1 for each pixel."""
+    places: IndexArray = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    return places
+
+
 def _take_ragged(arrays: SceneArrays, offsets: IndexArray, pixels: IndexArray, share: float,
-                 rng: np.random.Generator | None) -> Crop:
+                 rng: np.random.Generator | None, even: bool) -> Crop:
     """The pixels of these numbers; the share is rounded at random, and no pixel that has samples loses them all."""
     start = offsets[pixels]
     held = offsets[pixels + 1] - start
@@ -94,9 +120,14 @@ def _take_ragged(arrays: SceneArrays, offsets: IndexArray, pixels: IndexArray, s
         rounding = 0.5 if rng is None else rng.random(pixels.size)
         counts = np.clip(np.floor(held * share + rounding).astype(np.int64), np.minimum(held, 1), held)
         first = np.zeros_like(held) if rng is None else (rng.random(pixels.size) * held).astype(np.int64)
-    within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    circle = (within + np.repeat(first, counts)) % np.repeat(held, counts)
-    index = np.repeat(start, counts) + circle
+    if even and arrays.weight is None:
+        there = np.repeat(start, held) + _within(held)
+        time = arrays.samples[there, CHANNELS["time"].start]
+        by_time = there[np.lexsort((time, np.repeat(np.arange(held.size), held)))]
+        index = by_time[np.repeat(np.cumsum(held) - held, counts) + spread(held, counts, rng)]
+    else:
+        circle = (_within(counts) + np.repeat(first, counts)) % np.repeat(held, counts)
+        index = np.repeat(start, counts) + circle
     if arrays.weight is not None:
         weight = arrays.weight[index]
     else:
@@ -147,7 +178,8 @@ def random_batch(cache: SampleCache, recipe: Recipe, step: int, part: slice = sl
         arrays = cache.arrays(entry)
         y, x = (slice(c, c + size) for c in (int(rng.integers(0, e - size + 1)) for e in (entry.height, entry.width)))
         turn = Turn.draw(rng) if how.symmetries else Turn()
-        crop = take(arrays, y, x, turn, count, count / entry.samples, rng)
+        even = "time" in entry.roles and rng.random() < recipe.even_times
+        crop = take(arrays, y, x, turn, count, count / entry.samples, rng, even)
         turn.directions(crop.values)
         target, gain = relight(rng, crop.values, turn.picture(arrays.target[y, x]), how)
         crops.append(crop)

@@ -59,6 +59,9 @@ class Recipe:
     samples: Annotated[
         Odds, "samples per pixel and how often a batch has so many; never more than a scene holds"
     ] = ((1, 0.05), (2, 0.1), (4, 0.25), (8, 0.45), (16, 0.15))
+    even_times: Annotated[
+        float, "share of the crops whose samples are spread evenly over the shutter, as renderers spread them"
+    ] = 0.7
     layers: Annotated[
         Odds, "layers and how often a batch uses so many; never more than the network has"
     ] = ((1, 0.1), (2, 0.75), (3, 0.15))
@@ -89,6 +92,7 @@ class Recipe:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be above 0")
         how = self.augmentation
         shares = {"final_rate": self.final_rate, "average": self.average, "finish": self.finish,
+                  "even_times": self.even_times,
                   "augmentation.drop_roles": how.drop_roles, "augmentation.drop_each": how.drop_each,
                   "augmentation.fireflies": how.fireflies}
         for name, share in shares.items():

@@ -63,7 +63,7 @@ def validate(net: Denoiser, cache: SampleCache, recipe: Recipe, stopped: Callabl
         arrays = cache.arrays(entry)
         y, x = (_middle(extent, recipe.validation_size) for extent in (entry.height, entry.width))
         count = min(recipe.validation_samples, entry.samples)
-        crop = take(arrays, y, x, Turn(), count, count / entry.samples)
+        crop = take(arrays, y, x, Turn(), count, count / entry.samples, even="time" in entry.roles)
         samples = move(to_samples([crop], common_roles([entry]), y.stop - y.start, x.stop - x.start), device)
         target = torch.from_numpy(np.array(arrays.target[y, x])).to(device).permute(2, 0, 1)[None]
         layers = net(samples, UNIT)

@@ -23,7 +23,7 @@ from pipelines.rendering.patterns import make_pattern
 from pipelines.rendering.shots import RenderSettings, estimated_noise, is_worth_rendering, scale_and_cut
 from pipelines.rendering.stage import Stage
 from pipelines.rendering.stage_scene import StageTracer
-from pipelines.rendering.tracer import MISS_DEPTH, TIME_BINS, Motion
+from pipelines.rendering.tracer import MISS_DEPTH, Motion
 from pipelines.rendering.views import CAMERA_MOTION_RANGE, View, add_camera_motion
 from tests.runner import in_process, require_renderer
 
@@ -32,6 +32,7 @@ require_renderer()
 Array = npt.NDArray[np.float32]
 
 SIZE = 32
+TIME_BINS = 16  # of the shutter, in moving scenes
 HALF_WIDTH = 2.0  # of the wall that the camera looks at
 SMALL = RenderSettings(samples=4, reference=4, size=SIZE, layout="tabletop")
 
@@ -300,6 +301,23 @@ def test_other_settings_do_not_mix_with_what_is_there(tmp_path: Path) -> None:
     about.write_text("[]")
     with pytest.raises(InputError, match="scene000010.json: is not an example's JSON; delete it"):
         render_scenes(of_scene, "none")
+
+
+def test_another_scene_of_the_same_file_name_does_not_mix_with_what_is_there(tmp_path: Path) -> None:
+    scene = tmp_path / "room.xml"
+    scene.write_text(SCENE)
+    of_scene = options(tmp_path / "files", count=1, settings=RenderSettings(2, 2, SIZE), contact_sheet=False,
+                       scene=scene)
+    assert render_scenes(of_scene, "none").exit_code == 0
+    assert render_scenes(of_scene, "none").frames == ()
+    scene.write_text(SCENE.replace("0.6", "0.5"))
+    with pytest.raises(UsageError, match="scene000010.json: was rendered of .*room.xml before that changed"):
+        render_scenes(of_scene, "none")
+    about = tmp_path / "files" / "scene000010.json"
+    older = json.loads(about.read_text())
+    del older["scene_digest"]
+    about.write_text(json.dumps(older))
+    assert render_scenes(of_scene, "none").frames == ()
 
 
 def test_workers_give_the_same_examples_as_one_process(tmp_path: Path) -> None:

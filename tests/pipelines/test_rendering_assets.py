@@ -16,7 +16,9 @@ from pipelines.rendering.layouts import LAYOUTS
 from pipelines.rendering.materials import QUOTAS, SLOT_KINDS
 from pipelines.rendering.patterns import concentric_disk, join, make_pattern, shuffle_order, shutter_times
 from pipelines.rendering.stage import Stage
-from pipelines.rendering.tracer import TIME_BINS, Motion
+from pipelines.rendering.tracer import Motion
+
+TIME_BINS = 16
 
 
 @pytest.mark.parametrize("name", textures.TEXTURES)

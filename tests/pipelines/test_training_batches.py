@@ -7,11 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from model.denoiser import Denoiser
 from model.features import FrameScale
 from pipelines.training.augment import Turn, relight
-from pipelines.training.batches import Batch, Crop, random_batch, take
+from pipelines.training.batches import Batch, Crop, random_batch, spread, take
 from pipelines.training.cache import CHANNEL_COUNT, CHANNELS, SampleCache, SceneArrays
 from pipelines.training.caching import build_cache
 from pipelines.training.recipe import Augmentation, Recipe
@@ -94,12 +96,13 @@ def labelled(counts: np.ndarray) -> SceneArrays:
     return SceneArrays(samples, target, offsets)
 
 
+@pytest.mark.parametrize("even", [False, True])
 @pytest.mark.parametrize("turn", TURNS)
-def test_a_ragged_crop_takes_distinct_samples_of_its_own_pixels(turn: Turn) -> None:
+def test_a_ragged_crop_takes_distinct_samples_of_its_own_pixels(turn: Turn, even: bool) -> None:
     counts = uneven(8)
     arrays = labelled(counts)
     y, x = slice(3, 11), slice(20, 28)
-    crop = take(arrays, y, x, turn, 4, 0.5, np.random.default_rng(1))
+    crop = take(arrays, y, x, turn, 4, 0.5, np.random.default_rng(1), even)
     pixels = turn.picture(arrays.target[y, x])[..., 0].ravel()
     np.testing.assert_array_equal(np.repeat(pixels, crop.counts), crop.values[:, 0])
     labels = crop.values[:, :2].astype(int)
@@ -115,6 +118,36 @@ def test_subsets_of_a_ragged_scene_are_drawn_pixel_by_pixel() -> None:
     chosen = crop.values[:, 1]
     assert set(np.unique(chosen)) == set(range(8))
     assert crop.counts.tolist() == [1] * 256
+
+
+@given(st.lists(st.integers(0, 40), min_size=1), st.integers(1, 40), st.sampled_from([None, 1]))
+def test_spread_places_ascend_and_leave_no_wide_gap(held: list[int], most: int, seed: int | None) -> None:
+    sizes = np.array(held, np.int64)
+    counts = np.minimum(sizes, most)
+    places = spread(sizes, counts, None if seed is None else np.random.default_rng(seed))
+    for size, own in zip(held, np.split(places, counts.cumsum()[:-1]), strict=True):
+        edges = np.concatenate([[-1], own, [size]])
+        assert np.all(np.diff(edges) >= 1)
+        assert not len(own) or np.diff(edges).max() <= 2 * np.ceil(size / len(own)) + 1
+
+
+@pytest.mark.parametrize("ragged", [False, True])
+@pytest.mark.parametrize("seed", [None, 3])
+def test_even_subsets_have_a_sample_in_each_interval_of_the_shutter(ragged: bool, seed: int | None) -> None:
+    """As many samples as the shutter has steps are one of each step, in any order that the cache has them."""
+    size, steps, each = 8, 4, 3
+    times = (np.arange(steps * each) // each + 0.5) / steps
+    times = np.random.default_rng(1).permuted(np.tile(times, (size * size, 1)), axis=1)
+    values = np.zeros((size * size, steps * each, CHANNEL_COUNT), np.float16)
+    values[..., TIME] = times
+    target = np.zeros((size, size, 3), np.float32)
+    offsets = np.arange(size * size + 1) * steps * each
+    arrays = (SceneArrays(values.reshape(-1, CHANNEL_COUNT), target, offsets) if ragged
+              else SceneArrays(values.reshape(size, size, -1, CHANNEL_COUNT), target))
+    rng = None if seed is None else np.random.default_rng(seed)
+    crop = take(arrays, slice(0, size), slice(0, size), Turn(), steps, 1 / each, rng, even=True)
+    taken = np.sort(crop.values[:, TIME].reshape(-1, steps), axis=1)
+    np.testing.assert_allclose(taken, np.tile((np.arange(steps) + 0.5) / steps, (size * size, 1)))
 
 
 def test_without_a_generator_a_crop_is_the_first_samples(cache: SampleCache) -> None:
