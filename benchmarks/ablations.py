@@ -65,6 +65,7 @@ def embedding_of(width: int) -> Config:
 ENCODING, CONTEXT, KERNELS = "encoding and statistics", "context", "kernels"
 LAYERS, TRAINING, DATA = "layers", "training", "data"
 NO_PATHS = replace(SMALL_FAST, demodulation=False)
+WIDE = replace(SMALL_FAST, kernel_sizes=(9, *SMALL_FAST.kernel_sizes[1:]))
 CHANGES = (
     Change(ENCODING, "the paper's encoding", replace(SMALL_FAST, encoding="paper")),
     Change(ENCODING, "no statistics in the context", replace(SMALL_FAST, statistics=False)),
@@ -100,7 +101,14 @@ CHANGES = (
     Change(KERNELS, "learned features of the divisor", replace(SMALL_FAST, divisor_features=4)),
     Change(LAYERS, "no guard of the entropy", recipe=replace(RECIPE, partition_entropy=0.0)),
     Change(TRAINING, "Muon", recipe=replace(RECIPE, muon=True)),
-    Change(KERNELS, "9x9 finest window", replace(SMALL_FAST, kernel_sizes=(9, *SMALL_FAST.kernel_sizes[1:]))),
+    Change(KERNELS, "9x9 finest window", WIDE),
+    Change(KERNELS, "11x11 finest window", replace(SMALL_FAST, kernel_sizes=(11, *SMALL_FAST.kernel_sizes[1:]))),
+    Change(KERNELS, "9x9, then 5x5", replace(SMALL_FAST, kernel_sizes=(9, 5, *SMALL_FAST.kernel_sizes[2:]))),
+    Change(KERNELS, "9x9, then 5x5 at all levels", replace(SMALL_FAST, kernel_sizes=(9, 5, 5, 5, 5, 5))),
+    Change(KERNELS, "9x9 at two levels", replace(SMALL_FAST, kernel_sizes=(9, 9, *SMALL_FAST.kernel_sizes[2:]))),
+    Change(KERNELS, "9x9 finest window, 16 features", replace(WIDE, affinity_features=16)),
+    Change(KERNELS, "9x9 finest window, filtered guides", replace(WIDE, filtered_guides=True)),
+    Change(KERNELS, "twice the penalty of glare", replace(SMALL_FAST, glare_per_level=1.0)),
 )
 """In order of importance: what a short evening gets done."""
 

@@ -62,6 +62,9 @@ SMALL_FAST = replace(
     kernel_sizes=(5, 3, 3, 3, 3, 3),
     guide_gates=1,
     divisor_features=0,
+    filtered_guides=False,
+    glare_per_level=0.5,
+    glare_in_cells=0.0,
 )
 PIXEL_FAST = replace(SMALL_FAST, variant="pixel_gather", reducer=(), partition_logits=1, layers=1, confidence=False,
                      depth_prior=False)

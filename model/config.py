@@ -80,6 +80,8 @@ class Config:
     demodulation: bool = True  # mix in a path whose kernels average radiance divided by albedo + specular
     divisor_features: int = 0  # learned features of the kernel that filters the divisor, beside the divisor itself
     filtered_guides: bool = False  # mix guides with themselves behind the divisor's kernel, as much as is predicted
+    glare_per_level: float = 0.5  # what a log unit of glare takes from a source's logit at each coarser level, gated
+    glare_in_cells: float = 0.0  # and at all of these levels alike, not gated
 
     def __post_init__(self) -> None:
         if len(self.unet.encoder) != len(self.unet.decoder):
@@ -186,9 +188,11 @@ FAST = Config(
     reducer=(32, 32, 24),
     partitioner=(24, 16),
     generator=(48, 48),
-    kernel_sizes=(9, 3, 3, 3, 3, 3),
+    kernel_sizes=(9, 5, 3, 3, 3, 3),
     guide_gates=3,
     divisor_features=4,
+    filtered_guides=True,
+    glare_per_level=1.0,
 )
 
 CONFIGS: Mapping[str, Config] = {

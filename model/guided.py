@@ -21,9 +21,6 @@ from model.samples import Samples, columns
 GUIDE_SCALES = (2.0, 2.0, 2.0, 3.0, 1.5, 1.5, 1.5)  # normal, log depth, divisor: the joint bilateral filter at step 0
 GUIDE_WIDTHS = (3, 1, 3)
 DIVISOR = slice(4, 7)  # of the guides
-# What a log unit of glare takes from a source's logit at each coarser level: a cell that holds a corner of a lamp is
-# hardly farther from its dark pixels than one without, and a thousand times brighter.
-GLARE_PER_LEVEL = 0.5
 GLARE_SCALE = 2.0  # of glare as a feature
 GLARE_START = 3.0  # log(1 + exposure L): radiance about 20 times the frame's middle
 DIVISOR_GUIDE_SCALE = 6.0  # the divisor's own, sharper kernel
@@ -114,8 +111,11 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
     if config.demodulation:
         mix, *kernel, amounts = divided
         guides, factor = _filtered_guides(guides, log_w, kernel, amounts, config, active)
-    beyond = glare(planes[:, RADIANCE] / own, scale.exposure) * (0.5 + torch.sigmoid(glare_gate))
-    bias = bias - beyond * GLARE_PER_LEVEL * torch.arange(bias.shape[1], device=bias.device)[:, None, None]
+    bright = glare(planes[:, RADIANCE] / own, scale.exposure)
+    beyond = bright * (0.5 + torch.sigmoid(glare_gate))
+    # A cell that holds a corner of a lamp is hardly farther from its dark pixels, and a thousand times brighter.
+    level = torch.arange(bias.shape[1], device=bias.device)[:, None, None]
+    bias = bias - beyond * config.glare_per_level * level - bright * config.glare_in_cells * level.clamp_max(1)
     gates = 2 * torch.sigmoid(gate)
     if config.guide_gates > 1:
         gates = _for_each_guide(gates)
