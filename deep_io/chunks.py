@@ -67,6 +67,16 @@ def chunk_count(header: Header, where: str) -> int:
     return count
 
 
+def flat_chunk_rows(header: Header, where: str) -> int:
+    """Rows that a flat part stores together: of a chunk of scanlines, or of a tile. Raises InputError."""
+    if header.type == "tiledimage":
+        return tile_description(header, where)[1]
+    if header.type != "scanlineimage" or header.compression not in _ROWS_PER_CHUNK:
+        raise InputError(f"{where}: the header's type is {header.type} and its compression {header.compression}, which "
+                         f"lbmc cannot read")
+    return _ROWS_PER_CHUNK[header.compression]
+
+
 def tile_description(header: Header, where: str) -> tuple[int, int, int]:
     """A tile's width and height, and the byte that says which levels there are. Raises InputError."""
     tiles = header.structure.get("tiles")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import OpenEXR
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from deep_io.attributes import Attribute
 from deep_io.errors import InputError
-from deep_io.header import Header, channels_of, open_input, parse_headers
+from deep_io.header import FileHeaders, Header, channels_of, open_input, parse_headers
 from deep_io.library import read_with_library
 from deep_io.reheading import last_flat_chunk_end, read_chunk_table, reheaded
 from deep_io.samples import Window
@@ -111,14 +111,7 @@ def read_flat_parts(path: PathLike) -> list[FlatImage]:
     """
     name = os.fspath(path)
     with open_input(path) as file:
-        headers = parse_headers(file, name)
-        if any(header.is_deep for header in headers.parts):
-            raise InputError(f"{name}: is a deep EXR where a flat one is needed")
-        if any(channel.sampling != (1, 1) for header in headers.parts for channel in header.channels):
-            raise InputError(f"{name}: has subsampled channels; convert it to full resolution")
-        size = os.fstat(file.fileno()).st_size
-        if last_flat_chunk_end(file, headers, read_chunk_table(file, headers, name)) > size:
-            raise InputError(f"{name}: the pixels are truncated or corrupt: they run past the end of the file")
+        headers, _ = parse_flat(file, name)
         parts = read_with_library(file, headers, name)
     images = []
     for header, channels in zip(headers.parts, parts, strict=True):
@@ -127,6 +120,22 @@ def read_flat_parts(path: PathLike) -> list[FlatImage]:
             raise InputError(f"{name}: the pixels are truncated or corrupt")
         images.append(FlatImage(channels, header))
     return images
+
+
+def parse_flat(file: BinaryIO, path: str) -> tuple[FileHeaders, NDArray[np.uint64]]:
+    """A flat EXR's headers and chunk table, checked as far as they can be without decoding a pixel.
+
+    Raises InputError when the file is unreadable, truncated, deep or subsampled.
+    """
+    headers = parse_headers(file, path)
+    if any(header.is_deep for header in headers.parts):
+        raise InputError(f"{path}: is a deep EXR where a flat one is needed")
+    if any(channel.sampling != (1, 1) for header in headers.parts for channel in header.channels):
+        raise InputError(f"{path}: has subsampled channels; convert it to full resolution")
+    table = read_chunk_table(file, headers, path)
+    if last_flat_chunk_end(file, headers, table) > os.fstat(file.fileno()).st_size:
+        raise InputError(f"{path}: the pixels are truncated or corrupt: they run past the end of the file")
+    return headers, table
 
 
 def write_flat(path: PathLike, channels: Mapping[str, Pixels], header: Header | None = None, compression: str = "zip",

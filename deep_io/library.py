@@ -34,9 +34,13 @@ def read_with_library(file: BinaryIO, headers: FileHeaders, path: str) -> list[d
 
     Raises InputError when the library cannot read all of them, MemoryError when it is the memory.
     """
+    return decode_with_library(_bare_file(file, headers, path), headers, path)
+
+
+def decode_with_library(stream: BytesIO, headers: FileHeaders, path: str) -> list[dict[str, NDArray[Any]]]:
+    """As `read_with_library`, of an EXR in memory that has the parts and channels of `headers` in bare headers."""
     import OpenEXR  # 70 ms of start-up that the decoders of rows.py do not need.
 
-    stream = _bare_file(file, headers, path)
     try:
         with _said() as said, OpenEXR.File(stream, separate_channels=True) as opened:
             parts = [[channel.pixels for _, channel in sorted(part.channels.items())] for part in opened.parts]

@@ -38,7 +38,7 @@ from deep_io.sequences import (
 )
 from deep_io.weighting import ATTRIBUTE, RADIANCE_LAYERS, Packed, encode_packed
 from pipelines import __version__
-from pipelines.flat_renders import RenderStack, read_renders
+from pipelines.flat_renders import BAND_BYTES, RenderStack, open_renders
 from pipelines.jobs import FrameSkippedError, JobReport, run_frames
 from pipelines.progress import Progress, ProgressKind, make_progress
 
@@ -183,25 +183,32 @@ def pack(sources: Sequence[PathLike], target: PathLike, options: PackOptions | N
     """Pack the renders of one frame into `target`; None where it exists and is to be skipped.
 
     Raises InputError for renders that do not fit together, are unreadable, or hold the same picture twice; UsageError
-    for a refused output.
+    for a refused output; MemoryError, naming it, when a block of rows does not fit.
     """
     options = options or PackOptions()
     if options.pixel_type not in ("half", "float"):
         raise UsageError(f"--pixel-type {options.pixel_type}: must be half or float")
     if not _writes(target, sources, options.existing):
         return None
-    stack = read_renders(sources, options.overrides, options.layers)
-    how = _Encoding(stack, options)
-    window, repairs = stack.header.data_window, Counter[str]()
-    rows = max(1, _BLOCK_SAMPLES // (window.width * len(stack.frames)))
+    stack = open_renders(sources, options.overrides, options.layers)
+    how, repairs = _Encoding(stack, options), Counter[str]()
+    try:
+        _write(stack, how, target, options, repairs, progress)
+    except MemoryError as error:
+        raise MemoryError(f"{os.fspath(target)}: {error}") from error
+    return PackReport(Path(target), len(stack.renders), stack.mapping, tuple(how.notes), repairs)
+
+
+def _write(stack: RenderStack, how: _Encoding, target: PathLike, options: PackOptions, repairs: Counter[str],
+           progress: Progress | None) -> None:
+    """Write the whole file block by block, or none; what had to be mended is added to `repairs`."""
+    window = stack.header.data_window
     with atomic_output(target) as temporary, DeepWriter(temporary, how.header, options.compression,
                                                         options.threads) as writer:
-        for y0 in range(window.ymin, window.ymax + 1, rows):
-            y1 = min(y0 + rows, window.ymax + 1)
-            writer.write(how.encode(stack.block(y0, y1), repairs))
+        for block in stack.blocks(_BLOCK_SAMPLES):
+            writer.write(how.encode(block, repairs))
             if progress:
-                progress.update((y1 - window.ymin) / window.height)
-    return PackReport(Path(target), len(stack.frames), stack.mapping, tuple(how.notes), repairs)
+                progress.update((block.window.ymax + 1 - window.ymin) / window.height)
 
 
 def _writes(target: PathLike, sources: Sequence[PathLike] | Inputs, existing: Existing) -> bool:
@@ -225,10 +232,13 @@ class _Encoding:
     """How one stack is written: the conversions, the types of the channels, the header."""
 
     def __init__(self, stack: RenderStack, options: PackOptions) -> None:
-        mapping, path = stack.mapping, stack.sources[0]
+        mapping, path = stack.mapping, stack.renders[0].file.path
         self.mapping = mapping
-        self.notes = [f"assumed: {len(stack.frames)} renders of one sample per pixel each, pixel filter box"]
-        self.light_channels = self._light_channels([name for name in stack.frames[0] if name not in mapping.channels])
+        self.notes = [f"assumed: {len(stack.renders)} renders of one sample per pixel each, pixel filter box"]
+        if stack.pieces > 1:
+            self.notes.append(f"the renders are decompressed up to {stack.pieces} times over: rows stored together, "
+                              f"of all of them, are more than {BAND_BYTES >> 20} MiB; ZIP, 16 rows, is faster")
+        self.light_channels = self._light_channels([name for name in stack.channels if name not in mapping.channels])
         attributes: dict[str, object] = {ATTRIBUTE: "packed", "lbmc:version": __version__}
         camera = parse_camera(options.camera) if isinstance(options.camera, str) else options.camera
         given = resolve(stack.header, mapping, path, options.normals, options.depth, camera, strict=False)
@@ -274,11 +284,11 @@ class _Encoding:
     def _radiance_type(self, stack: RenderStack, options: PackOptions) -> Any:
         if options.pixel_type == "float":
             return np.float32
-        if len(stack.frames) > MOST_IN_HALF:
+        if len(stack.renders) > MOST_IN_HALF:
             self.notes.append(f"radiance is float: half underflows with more than {MOST_IN_HALF} samples")
             return np.float32
         colours = [*self.mapping["radiance"].channels, *self.light_channels]
-        if stack.largest(colours) > HALF_MAX:
+        if stack.goes_beyond_half(colours):
             self.notes.append("radiance is float: it goes beyond the range of half")
             return np.float32
         return np.float16
