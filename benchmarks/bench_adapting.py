@@ -36,9 +36,9 @@ from model.denoiser import Denoiser
 from model.features import FrameScale
 from model.metrics import geometric_mean, score
 from pipelines.cells import Cells
-from pipelines.compare import read_rgb
 from pipelines.decisions import decide, zero_roles
 from pipelines.denoise import Job
+from pipelines.flat_pictures import read_rgb
 from pipelines.inference import denoise_bands
 from pipelines.options import DenoiseOptions
 from pipelines.scene_names import DEEP, reference_of, scene_name

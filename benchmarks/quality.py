@@ -25,8 +25,9 @@ import numpy as np
 from deep_io.errors import LbmcError
 from deep_io.path_samples import PathSamples, SampleReader
 from model.baseline import clamp_and_blur, pixel_means
-from model.metrics import Scores, bootstrap_interval, geometric_mean, score
-from pipelines.compare import read_rgb
+from model.metrics import Scores, geometric_mean, score
+from pipelines.bench.results import spread
+from pipelines.flat_pictures import read_rgb
 from pipelines.oidn import Oidn
 from pipelines.options import DenoiseOptions
 from pipelines.pictures import panel
@@ -113,8 +114,9 @@ def cells(scores: Scores) -> str:
 def mean_cells(rows: list[Scores]) -> str:
     smape, psnr, energy = (np.mean([getattr(row, name) for row in rows]) for name in ("smape", "psnr", "energy"))
     errors = [row.relmse for row in rows]
-    low, high = bootstrap_interval(errors)
-    return f"**{geometric_mean(errors):.4f}** [{low:.4f}, {high:.4f}] / {smape:.4f} / {psnr:.2f} / {energy:.3f}"
+    found = spread(errors)
+    ends = "" if found is None else f" [{found[0]:.4f}, {found[1]:.4f}]"
+    return f"**{geometric_mean(errors):.4f}**{ends} / {smape:.4f} / {psnr:.2f} / {energy:.3f}"
 
 
 def table(results: dict[int, dict[str, dict[str, Scores]]], methods: list[str]) -> str:

@@ -34,7 +34,7 @@ from model.denoiser import Denoiser
 from model.features import FrameScale
 from model.metrics import common_scale, relmse, tone_mapped
 from model.samples import Samples
-from pipelines.compare import read_rgb
+from pipelines.flat_pictures import read_rgb
 from pipelines.inference import to_model
 from pipelines.network import find_weights
 from pipelines.survey import exposure_of, survey

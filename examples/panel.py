@@ -24,7 +24,7 @@ from deep_io.errors import LbmcError
 from deep_io.path_samples import SampleReader
 from model.baseline import pixel_means
 from model.metrics import Scores, common_scale, score, tone_mapped
-from pipelines.compare import read_rgb
+from pipelines.flat_pictures import read_rgb
 from pipelines.pictures import signed_error, worst_regions
 
 Picture = NDArray[np.floating[Any]]

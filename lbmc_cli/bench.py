@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from lbmc_cli.options import PROGRESS, LbmcCommand, option
+from lbmc_cli.options import PROGRESS, THREAD_COUNT, LbmcCommand, option
 
 
 @click.command(cls=LbmcCommand)
@@ -28,7 +28,7 @@ from lbmc_cli.options import PROGRESS, LbmcCommand, option
     help="Preset or .safetensors file to measure. Repeatable.  [default: the presets that ship]",
 )
 @option("--match", default="*", show_default=True, metavar="GLOB", help="Only scenes whose NAME matches.")
-@option("--threads", type=click.IntRange(1), default=1, show_default=True, metavar="N", help="CPU threads.")
+@option("--threads", type=THREAD_COUNT, default=1, show_default=True, metavar="N", help="CPU threads.")
 @option("--repeats", type=click.IntRange(1), default=3, show_default=True, help="Timed runs of each method and scene.")
 @option(
     "--frame",
@@ -47,14 +47,16 @@ from lbmc_cli.options import PROGRESS, LbmcCommand, option
 @PROGRESS
 def bench(
     no_paper: bool, no_curves: bool, no_savings: bool, no_memory: bool, no_flip: bool, **choices: Any
-) -> None:
+) -> int:
     """Measure speed against error on DIR, a folder of NAME.deep.exr and NAME.ref.exr.
 
     lbmc, untrained filters, Intel OIDN where pyoidn is installed, and the paper's networks (random weights, so their
     time only) run on every scene. report.html is one page with charts, tables and all images; it needs no network.
+    Scenes that cannot be read are left out: the others are measured, and the exit code is 1.
     """
     from pipelines.bench.job import REPORT, TABLE, BenchOptions
     from pipelines.bench.job import bench as run
+    from pipelines.jobs import EXIT_OK, EXIT_SOME_FAILED
 
     options = BenchOptions(
         paper=not no_paper,
@@ -64,6 +66,12 @@ def bench(
         flip=not no_flip,
         **choices,
     )
-    run(options)
+    results = run(options)
     click.echo((options.out / TABLE).read_text("utf-8"))
     click.echo(f"report: {options.out / REPORT}", err=True)
+    if not results.failed:
+        return EXIT_OK
+    click.echo("failed scenes:", err=True)
+    for name, why in results.failed.items():
+        click.echo(f"  {name}: {why}", err=True)
+    return EXIT_SOME_FAILED

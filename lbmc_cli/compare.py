@@ -16,7 +16,13 @@ from lbmc_cli.report import end_job
 @click.command(cls=LbmcCommand)
 @click.argument("image", metavar="IMAGE")
 @click.argument("reference", metavar="REFERENCE")
-@option("--frames", metavar="RANGE", help="Frames of a sequence, e.g. 1001-1100x2.  [default: those that both have]")
+@option(
+    "--frames",
+    metavar="RANGE",
+    help="Frames of a sequence, e.g. 1001-1100x2.  [default: all; if some are not in every sequence, exit code 1]",
+)
+@option("--part", help="Part of multi-part files, by name or number from 0.  [default: the first with R, G, B]")
+@option("--layer", metavar="NAME", help="Layer to measure; files whose only colour is R, G, B are taken as they are.")
 @option(
     "--other-half",
     metavar="FILE",
@@ -32,7 +38,8 @@ def compare(as_json: bool, no_flip: bool, **choices: Any) -> int:
     """Measure IMAGE against REFERENCE, two flat EXRs in linear light.
 
     All metrics but the energy are taken after one common scale, 0.5 / mean(min(reference, its 99th percentile)). Both
-    may be sequences (image.####.exr); then a table and the means are printed.
+    may be sequences (image.####.exr); then a table and the means are printed: geometric ones of relMSE, trimmed and
+    small_epsilon (0 where one frame has none of that error), arithmetic ones of the others.
     """
     from pipelines.compare import CompareOptions, compare_frames, comparison_as_dict, comparison_lines
 
@@ -40,9 +47,9 @@ def compare(as_json: bool, no_flip: bool, **choices: Any) -> int:
     with redirect_stdout(sys.stderr) if as_json else nullcontext():
         report = compare_frames(CompareOptions(flip=not no_flip, **choices))
     if as_json:
-        click.echo(json.dumps(comparison_as_dict(report.values), indent=2))
+        click.echo(json.dumps(comparison_as_dict(report), indent=2))
     elif report.values:
         click.echo("\n".join(comparison_lines(report.values)))
-    if len(report.frames) > 1 or report.failed:
+    if len(report.frames) > 1 or report.failed or report.left_out:
         return end_job(report)
     return report.exit_code

@@ -196,9 +196,11 @@ reading_options = together(
 )
 """How a deep sample file is read; the same for every command that reads one."""
 
+THREAD_COUNT = click.IntRange(1, MOST_THREADS)
+"""Type of every option that says how many threads or processes there are to be."""
 THREADS = option(
     "--threads",
-    type=click.IntRange(1, MOST_THREADS),
+    type=THREAD_COUNT,
     metavar="N",
     help="CPU threads.  [default: all that the process may use]",
 )

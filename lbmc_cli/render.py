@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from lbmc_cli.options import PROGRESS, LbmcCommand, option
+from lbmc_cli.options import PROGRESS, THREAD_COUNT, LbmcCommand, option
 from lbmc_cli.report import end_job
 
 
@@ -27,8 +27,8 @@ from lbmc_cli.report import end_job
 @option("--layout", metavar="NAME", help="Only interior, outdoor, tabletop or floating scenes.  [default: a mix]")
 @option("--defocus/--no-defocus", default=None, help="Defocus in every scene, or in none.  [default: in half]")
 @option("--motion/--no-motion", default=None, help="Motion in every scene, or in none.  [default: in half]")
-@option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes that render side by side.")
-@option("--threads", type=click.IntRange(1), metavar="N", help="Threads per worker.  [default: share the cores]")
+@option("--workers", type=THREAD_COUNT, default=1, show_default=True, help="Processes that render side by side.")
+@option("--threads", type=THREAD_COUNT, metavar="N", help="Threads per worker.  [default: share the cores]")
 @option("--contact-sheet/--no-contact-sheet", default=True, help="Write contact-sheet.png to look at.  [default: yes]")
 @PROGRESS
 def render(

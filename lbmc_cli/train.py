@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from lbmc_cli.options import LbmcCommand, option
+from lbmc_cli.options import THREAD_COUNT, LbmcCommand, option
 
 
 @click.command(cls=LbmcCommand)
@@ -33,8 +33,8 @@ from lbmc_cli.options import LbmcCommand, option
         help="Stop after this long, resumable; no weights are written then.")
 @option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True,
         help="auto: the GPU if there is one.")
-@option("--threads", type=click.IntRange(1), metavar="N", help="CPU threads of each process.")
-@option("--loaders", type=click.IntRange(1), default=1, show_default=True, metavar="N",
+@option("--threads", type=THREAD_COUNT, metavar="N", help="CPU threads of each process.")
+@option("--loaders", type=THREAD_COUNT, default=1, show_default=True, metavar="N",
         help="Threads of each process that make batches; more for a fast GPU.")
 def train(
     data: Path,

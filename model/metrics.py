@@ -90,14 +90,17 @@ def score(image: Image, reference: Image, other_half: Image | None = None, *, wi
 def common_scale(reference: Image) -> float:
     """k = 0.5 / mean(min(reference, its 99th percentile)): the reference's mean, fireflies apart, becomes mid grey.
 
-    Raises ValueError when that mean is not positive.
+    Raises ValueError when that mean is not positive, and says whether for lack of light or for negative values.
     """
     r = np.asarray(reference, dtype=np.float64)
     mean = float(np.minimum(r, np.percentile(r, SCALE_PERCENTILE)).mean())
     if not mean > 0.0:
-        if r.mean() > 0.0:
-            raise ValueError("99 % of the reference's values are black, so there is no scale to measure on")
-        raise ValueError(f"the reference has no light in it (mean {mean:g}), so there is no scale to measure on")
+        why = f"the reference's mean is {mean:g}, its brightest 1 % clipped: negative values outweigh its light"
+        if not (r > 0.0).any():
+            why = "the reference has no light in it: no value is above 0"
+        elif not (r < 0.0).any():
+            why = "99 % of the reference's values are black"
+        raise ValueError(f"{why}, so there is no scale to measure on")
     return MID_GREY / mean
 
 

@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from importlib.util import find_spec
 from math import isfinite, isnan
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from fileseq.frameset import FrameSet
 from numpy.typing import NDArray
 
 from deep_io.atomic import atomic_output, output_action
 from deep_io.errors import InputError, UsageError
-from deep_io.flat import read_flat
-from deep_io.samples import Window
-from deep_io.sequences import Frame, expand, frame_path, is_sequence
+from deep_io.sequences import Frame, expand, frame_path, has_range, is_sequence
 from model.metrics import Scores, geometric_mean, score
+from pipelines.flat_pictures import FlatPicture, PathLike, read_rgb
 from pipelines.jobs import JobReport, run_frames
 from pipelines.pictures import heat_map, panel
 from pipelines.progress import Progress, ProgressKind, make_progress
-
-PathLike = str | os.PathLike[str]
 
 TITLES = {
     "relmse": "relMSE",
@@ -40,15 +38,6 @@ TITLES = {
 """Field of Scores to its name for a reader, in the order shown."""
 GEOMETRIC = ("relmse", "relmse_trimmed", "relmse_small_epsilon")
 """Averaged over images as geometric means; the others as means."""
-
-
-@dataclass(frozen=True)
-class FlatPicture:
-    """The colour of a flat EXR: `rgb` (H, W, 3) and where its pixels stand in the frame."""
-
-    path: str
-    rgb: NDArray[np.floating[Any]]
-    window: Window
 
 
 @dataclass(frozen=True)
@@ -88,7 +77,10 @@ class CompareOptions:
     other_half: str | None = None
     """`reference` and this are independent renderings of one picture."""
     frames: str | None = None
-    """Fileseq range. None: the frames that all sequences have."""
+    """Fileseq range. None: the frames that all sequences have; the others are told, and as good as failed."""
+    part: str | None = None
+    """Of multi-part files, see `read_rgb`."""
+    layer: str | None = None
     heat_map: str | None = None
     """PNG to write; a pattern for sequences."""
     panel: str | None = None
@@ -101,13 +93,14 @@ def compare_frames(options: CompareOptions) -> JobReport[Comparison]:
     """Compares a file or all frames of a sequence and writes the pictures asked for.
 
     Raises InputError when no frame is in common, UsageError for outputs that are refused. What is wrong with one frame
-    fails that frame only; see `compare`.
+    fails that frame only; see `compare`. Frames that not all sequences have are left out, told, and in the report.
     """
-    frames = _frames(options)
+    selection = _select(options)
+    frames = selection.frames
     pictures = _pictures(options, frames)
 
     def work(frame: Frame, progress: Progress) -> Comparison:
-        comparison = compare(*_inputs(options, frame), with_flip=options.flip)
+        comparison = compare(*_inputs(options, frame), part=options.part, layer=options.layer, with_flip=options.flip)
         for pattern, draw in pictures.items():
             with atomic_output(_of_frame(pattern, frame)) as path:
                 path.write_bytes(draw(comparison))
@@ -116,7 +109,9 @@ def compare_frames(options: CompareOptions) -> JobReport[Comparison]:
     with make_progress(options.progress if len(frames) > 1 else "none", len(frames)) as progress:
         if options.flip and not flip_installed():
             progress.note("FLIP is left out: flip-evaluator is not installed; install lbmc with its extra 'bench'")
-        return run_frames(frames, work, progress)
+        if selection.missing:
+            progress.note(selection.note())
+        return replace(run_frames(frames, work, progress), left_out=selection.left_out(options.image))
 
 
 def flip_installed() -> bool:
@@ -124,9 +119,41 @@ def flip_installed() -> bool:
     return find_spec("flip_evaluator") is not None
 
 
-def _frames(options: CompareOptions) -> list[Frame]:
-    frames = expand(options.image, options.frames)
+@dataclass(frozen=True)
+class _Selection:
+    """The frames to compare.
+
+    missing : sequence -> numbers of the frames that another has and it lacks, ascending
+    """
+
+    frames: list[Frame]
+    missing: dict[str, list[int]] = field(default_factory=dict)
+
+    def note(self) -> str:
+        """What is left out, for a reader."""
+        left_out = len(set().union(*self.missing.values()))
+        lacks = "; ".join(f"{pattern} lacks {FrameSet(numbers)}" for pattern, numbers in self.missing.items())
+        return (f"{left_out} of {left_out + len(self.frames)} frames are left out: {lacks}; "
+                "pass --frames to name those to compare")
+
+    def left_out(self, image: str) -> dict[str, str]:
+        """Name of the image of each frame that is left out -> the files that are missing."""
+        found: dict[str, str] = {}
+        for number in sorted(set().union(*self.missing.values())):
+            lacking = [pattern for pattern, numbers in self.missing.items() if number in numbers]
+            files = " and ".join(str(frame_path(pattern, number)) for pattern in lacking)
+            found[frame_path(image, number).name] = f"{files}: no such file"
+        return found
+
+
+def _select(options: CompareOptions) -> _Selection:
+    """Raises InputError for what is missing, a folder, or a sequence without a frame that all others have."""
     others = [other for other in (options.reference, options.other_half) if other is not None]
+    for path in (options.image, *others):
+        if os.path.isdir(path):
+            raise InputError(f"{path}: is a folder; name a sequence in it, such as {Path(path, 'NAME.####.exr')}, or "
+                             "use lbmc bench DIR for deep files with references")
+    frames = expand(options.image, options.frames)
     many = is_sequence(options.image)
     for other in others:
         if is_sequence(other):
@@ -134,12 +161,15 @@ def _frames(options: CompareOptions) -> list[Frame]:
                 raise InputError(f"{other}: is a sequence, but {options.image} is a single file; name one frame of it")
         elif not Path(other).exists():
             raise InputError(f"{other}: no such file")
-    if options.frames is not None or not many:
-        return frames
-    common = [frame for frame in frames if all(_of_frame(other, frame).is_file() for other in others)]
+    if not many or options.frames is not None or has_range(options.image):
+        return _Selection(frames)
+    numbers = {pattern: {frame.number or 0 for frame in expand(pattern)}
+               for pattern in (options.image, *others) if is_sequence(pattern)}
+    every, common = set().union(*numbers.values()), set.intersection(*numbers.values())
     if not common:
         raise InputError(f"{' and '.join([options.image, *others])} have no frame in common")
-    return common
+    missing = {pattern: sorted(every - there) for pattern, there in numbers.items() if every - there}
+    return _Selection([frame for frame in frames if frame.number in common], missing)
 
 
 def _pictures(options: CompareOptions, frames: list[Frame]) -> dict[str, Callable[[Comparison], bytes]]:
@@ -172,14 +202,17 @@ def _of_frame(pattern: str, frame: Frame) -> Path:
 
 
 def compare(
-    image: PathLike, reference: PathLike, other_half: PathLike | None = None, *, with_flip: bool = True
+    image: PathLike, reference: PathLike, other_half: PathLike | None = None, *, part: str | None = None,
+    layer: str | None = None, with_flip: bool = True,
 ) -> Comparison:
     """Measures one image; with `other_half`, the reference is the mean of two independent renderings.
 
-    Raises InputError for files that cannot be read as flat RGB, windows that differ (both are named), values that are
-    not finite and a reference without light.
+    `part` and `layer` say which colour of the files, see `read_rgb`. Raises InputError for files that cannot be read as
+    flat RGB, windows that differ (both are named), values that are not finite, halves that are one and the same picture
+    and a reference without light.
     """
-    pictures = [read_rgb(path) for path in (image, reference, *([other_half] if other_half is not None else []))]
+    paths = (image, reference, *([other_half] if other_half is not None else []))
+    pictures = [read_rgb(path, part, layer) for path in paths]
     for other in pictures[1:]:
         if other.window != pictures[0].window:
             raise InputError(f"{_placed(pictures[0])}, but {_placed(other)}; compare images of one window")
@@ -188,23 +221,14 @@ def compare(
         if bad:
             raise InputError(f"{picture.path}: {bad} pixels are not finite, so no error can be measured")
     half = pictures[2] if other_half is not None else None
+    if half and np.array_equal(half.rgb, pictures[1].rgb):
+        raise InputError(f"{pictures[1].path} and {half.path} are the same picture; two independent renderings are "
+                         "needed")
     try:
         scores = score(pictures[0].rgb, pictures[1].rgb, half.rgb if half else None, with_flip=with_flip)
     except ValueError as error:
         raise InputError(f"{pictures[1].path}: {error}") from error
     return Comparison(pictures[0], pictures[1], half, scores)
-
-
-def read_rgb(path: PathLike) -> FlatPicture:
-    """The R, G, B of the first part of a flat EXR that has them.
-
-    Raises InputError for a file that is missing, not an EXR, deep, or without R, G, B.
-    """
-    flat = read_flat(path)
-    if not {"R", "G", "B"} <= set(flat.channels):
-        raise InputError(f"{os.fspath(path)}: no R, G, B channels (its channels: {', '.join(flat.channels)})")
-    rgb = np.stack([flat.channels[name].astype(np.float32) for name in "RGB"], axis=-1)
-    return FlatPicture(os.fspath(path), rgb, flat.window)
 
 
 def mean_scores(rows: Sequence[Scores]) -> dict[str, float | None]:
@@ -234,22 +258,35 @@ def score_lines(scores: Scores) -> list[str]:
     ]
 
 
-def comparison_as_dict(rows: Sequence[Comparison]) -> dict[str, Any]:
-    """All images and their means as plain values, for JSON."""
-    images = [{"image": row.image.path, "reference": row.reference.path, **scores_as_dict(row.scores)} for row in rows]
-    return {"images": images, "mean": _finite(mean_scores([row.scores for row in rows]))}
+def comparison_as_dict(report: JobReport[Comparison]) -> dict[str, Any]:
+    """All images and their means as plain values, and the frames that failed or were left out, for JSON."""
+    rows = report.values
+    return {
+        "images": [{"image": row.image.path, "reference": row.reference.path, **scores_as_dict(row.scores)}
+                   for row in rows],
+        "mean": _finite(mean_scores([row.scores for row in rows])),
+        "failed": [{"frame": frame.label, "error": frame.told} for frame in report.failed],
+        "left_out": [{"frame": label, "error": why} for label, why in report.left_out.items()],
+    }
 
 
 def comparison_lines(rows: Sequence[Comparison]) -> list[str]:
-    """One image: a line per metric. Several: a table, and their means in its last row."""
+    """One image: a line per metric. Several: a table that ends with their means, the geometric ones in a row apart."""
     if len(rows) == 1:
         return score_lines(rows[0].scores)
     means = mean_scores([row.scores for row in rows])
-    shown = {os.path.basename(row.image.path): asdict(row.scores) for row in rows} | {"mean": means}
+    shown = {os.path.basename(row.image.path): asdict(row.scores) for row in rows}
+    shown["geometric mean"] = {name: means[name] for name in GEOMETRIC}
+    shown["mean"] = {name: value for name, value in means.items() if name not in GEOMETRIC}
     width = max(map(len, shown))
     columns = [name for name in TITLES if means[name] is not None]
     head = f"{'':{width}}" + "".join(f"{name.removeprefix('relmse_') or name:>15}" for name in columns)
-    return [head, *(f"{name:{width}}" + "".join(f"{row[c]:15.5g}" for c in columns) for name, row in shown.items())]
+    return [head, *(f"{name:{width}}" + "".join(_cell(row.get(column)) for column in columns)
+                    for name, row in shown.items())]
+
+
+def _cell(value: float | None) -> str:
+    return f"{'–':>15}" if value is None else f"{value:15.5g}"
 
 
 def _finite(values: dict[str, float | None]) -> dict[str, float | None]:

@@ -6,8 +6,8 @@ What a frame means is the caller's: this module knows order, failures, exit code
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 from deep_io.errors import LbmcError
@@ -58,6 +58,8 @@ class JobReport(Generic[Value]):
     frames: tuple[FrameResult[Value], ...]
     cpu_known: bool = True
     """Whether the CPU seconds are the frames' own; those of other processes are not known."""
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    """Label of each frame that could not be tried -> why; as good as failed."""
 
     @property
     def failed(self) -> tuple[FrameResult[Value], ...]:
@@ -70,19 +72,22 @@ class JobReport(Generic[Value]):
 
     @property
     def exit_code(self) -> int:
-        """0 if no frame failed; the common code if every frame failed for one reason; else 1."""
+        """0 if no frame failed or was left out; the common code if every frame failed for one reason; else 1."""
         codes = {frame.exit_code for frame in self.frames}
         if not self.failed:
-            return EXIT_OK
+            return EXIT_SOME_FAILED if self.left_out else EXIT_OK
         return codes.pop() if len(codes) == 1 else EXIT_SOME_FAILED
 
     def summary(self) -> str:
-        """One line: how many frames were done, skipped and failed, and what a frame took."""
+        """One line: how many frames were done, skipped, left out and failed, and what a frame took."""
         done = [frame for frame in self.frames if frame.error is None and frame.skipped is None]
         skipped = len(self.frames) - len(done) - len(self.failed)
-        words = [f"{len(done)} of {len(self.frames)} {'frame' if len(self.frames) == 1 else 'frames'} done"]
+        total = len(self.frames) + len(self.left_out)
+        words = [f"{len(done)} of {total} {'frame' if total == 1 else 'frames'} done"]
         if skipped:
             words.append(f"{skipped} skipped")
+        if self.left_out:
+            words.append(f"{len(self.left_out)} left out")
         if self.failed:
             words.append(f"{len(self.failed)} failed")
         if done:

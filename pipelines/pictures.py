@@ -26,6 +26,7 @@ Float64 = NDArray[np.float64]
 
 ERROR_RANGE = 1.0
 """Relative errors beyond this share one colour; the drawn scale says so with arrow ends."""
+ERROR_LABEL = "relative error: blue too dark, red too bright"
 CROPS = 3
 DOTS_PER_INCH = 150
 COLUMN_INCHES = 3.2
@@ -143,8 +144,7 @@ def heat_map(image: Image, reference: Image) -> bytes:
     colors = _color_map()((np.clip(error, -ERROR_RANGE, ERROR_RANGE) / ERROR_RANGE + 1.0) / 2.0)
     squares = np.repeat(np.repeat(colors, dots, axis=0), dots, axis=1)
     figure.figimage(squares, xo=left, yo=whole_height - top - height * dots, origin="upper")
-    figure.text(left / whole_width, 1.0 - top / 2.0 / whole_height, "relative error: blue too dark, red too bright",
-                fontsize=8, va="center")
+    figure.text(left / whole_width, 1.0 - top / 2.0 / whole_height, ERROR_LABEL, fontsize=8, va="center")
     bar_height = min(drawn_height, HEAT_MAP_WIDTH)
     bar = figure.add_axes(((left + drawn_width + left) / whole_width, (whole_height - top - bar_height) / whole_height,
                            left / whole_width, bar_height / whole_height))
@@ -157,6 +157,11 @@ def panel(pictures: Mapping[str, Image], reference: Image, title: str = "") -> b
 
     Pictures are (H, W, 3) linear RGB, shown at the common scale as G(log(1 + x)).
     """
+    return _png(panel_figure(pictures, reference, title))
+
+
+def panel_figure(pictures: Mapping[str, Image], reference: Image, title: str = "") -> Figure:
+    """What `panel` is a PNG of."""
     k = common_scale(reference)
     shown = {**pictures, "reference": reference}
     tones = {name: tone_mapped(k * np.asarray(picture, np.float64)) for name, picture in shown.items()}
@@ -188,9 +193,10 @@ def panel(pictures: Mapping[str, Image], reference: Image, title: str = "") -> b
             grid[number][column].set_title(f"region {number}", fontsize=7)
     scale = figure.colorbar(_scale(), ax=grid[:, -1].tolist(), extend="both", fraction=0.05, pad=0.02)
     scale.ax.tick_params(labelsize=7)
+    scale.set_label(ERROR_LABEL, fontsize=7)
     if title:
         figure.suptitle(title, fontsize=10)
-    return _png(figure)
+    return figure
 
 
 def _figure(width: float, height: float, layout: Literal["constrained"] | None = "constrained") -> Figure:

@@ -29,9 +29,10 @@ from pipelines.bench.memory import measurable, peak_memory
 from pipelines.bench.methods import PAPER, LbmcMethod, Method, MethodSpec, make, method_specs, oidn_installed
 from pipelines.bench.report import Gallery, html_report, load_pillow
 from pipelines.bench.results import CurvePoint, Measurement, Results, SceneInfo, machine
-from pipelines.bench.scenes import Scene, find_scenes, write_enlarged, write_thinned
-from pipelines.bench.tables import markdown_report
-from pipelines.compare import read_rgb
+from pipelines.bench.scenes import Scene, find_pairs, open_scenes, without_reference, write_enlarged, write_thinned
+from pipelines.bench.tables import markdown_report, unpaired_line
+from pipelines.flat_pictures import read_rgb
+from pipelines.jobs import describe_error
 from pipelines.progress import Progress, ProgressKind, make_progress
 
 Item = TypeVar("Item")
@@ -79,21 +80,26 @@ class BenchOptions:
 def bench(options: BenchOptions) -> Results:
     """Measures, and writes results.json, results.md and report.html into `options.out`, which is made if need be.
 
-    Raises InputError for what is wrong with the folder or a scene (`find_scenes`), UsageError without Pillow, for
+    A scene that cannot be read is told at once and left out; `Results.failed` has it. So are deep files without a
+    reference. Raises InputError for what is wrong with the folder or with every scene, UsageError without Pillow, for
     outputs that exist and for models that do not.
     """
     load_pillow()
-    scenes = find_scenes(options.folder, options.match)
+    scenes, failed = open_scenes(find_pairs(options.folder, options.match))
+    unpaired = without_reference(options.folder, options.match)
     targets = [options.out / name for name in (RESULTS, TABLE, REPORT)]
     if options.out.is_dir():
         for target in targets:
             output_action(target, [scene.source for scene in scenes], "overwrite" if options.overwrite else "refuse",
                           can_skip=False)
     with tempfile.TemporaryDirectory(prefix="lbmc-bench-") as folder, Bench(options, scenes, Path(folder)) as run:
+        run.results.failed.update(failed)
+        run.results.protocol["without_reference"] = unpaired
         try:  # only now, when every model was found, but before any work
             options.out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"{options.out}: cannot be made a folder ({error.strerror})") from error
+            raise InputError(f"{options.out}: cannot be made a folder ({error.strerror}); name another --out"
+                             ) from error
         results, gallery = run.measure()
     texts = (json.dumps(_plain(results.to_dict()), indent=1, ensure_ascii=False) + "\n", markdown_report(results),
              html_report(results, gallery))
@@ -130,17 +136,22 @@ class Bench:
                 self.methods[spec.name] = method
                 stack.callback(method.close)
             self._open = stack.pop_all()
-        infos = [SceneInfo(scene.name, scene.width, scene.height, scene.samples) for scene in scenes]
         protocol = {
             "repeats": options.repeats, "warm_up": 1, "interleaved": True, "statistic": "median",
             "oidn": oidn_installed(), "growth_pixels": SIDE * SIDE,
             "frame": options.frame, "untrained_frame": min(options.frame, UNTRAINED_FRAME),
         }
-        self.results = Results(machine(options.threads), protocol, self.specs, infos)
+        self.results = Results(machine(options.threads), protocol, self.specs, [])
+        self.gallery = Gallery()
+        self._take(scenes)
+
+    def _take(self, scenes: list[Scene]) -> None:
+        """The scenes that are measured."""
+        self.scenes = scenes
+        self.results.scenes = [SceneInfo(scene.name, scene.width, scene.height, scene.samples) for scene in scenes]
         # One scene stands for all where each run is dear: the first of the largest group.
         self.example = next(s for s in scenes if s.samples == self.results.groups()[0])
         self.results.protocol["example"] = self.example.name
-        self.gallery = Gallery()
 
     def __enter__(self) -> Bench:
         return self
@@ -149,33 +160,70 @@ class Bench:
         self._open.close()
 
     def measure(self) -> tuple[Results, Gallery]:
-        """Everything, in order."""
+        """Everything, in order. Raises InputError when no scene can be read."""
         options = self.options
-        curves = [(scene, most) for scene in self.scenes for most in scene.thinned_counts()] if options.curves else []
-        frames = self._frames()
-        self.untrained = self._untrained(frames[self.example.name])
-        steps = len(self.scenes) + len(frames) * (1 + options.repeats) + len(curves) + len(options.growth)
-        with_memory = options.memory and measurable()
-        steps += len(self.specs) if with_memory else 0
-        with make_progress(options.progress, steps) as progress:
-            scores = {scene.name: dict(self._score(scene)) for scene in _steps(self.scenes, progress, "errors of")}
+        tried = len(self.scenes)
+        with make_progress(options.progress, tried + self._later_steps()) as progress:
+            self._tell(progress)
+            scores = self._scores(progress)
+            progress.total = tried + self._later_steps()
+            frames = self._frames()
+            self.untrained = self._untrained(frames[self.example.name])
             self._time(frames, scores, progress)
-            for scene, most in curves:
+            for scene, most in self._curves():
                 progress.begin(f"{scene.name} with {most} samples")
                 self._curve(scene, most)
                 progress.finish()
             self._grow(progress)
-            if with_memory:
+            if self._with_memory():
                 for spec in _steps(self.specs, progress, "memory of"):
                     self.results.memory[spec.name] = peak_memory(
                         spec, frames[self.example.name].source if spec.scored else self.untrained.source,
                         options.threads, self.folder)
         return self.results, self.gallery
 
+    def _tell(self, progress: Progress) -> None:
+        """What of the folder is left out from the start."""
+        unpaired = self.results.protocol["without_reference"]
+        if unpaired:
+            progress.note(unpaired_line(unpaired))
+        for error in self.results.failed.values():
+            progress.fail(error)
+
+    def _later_steps(self) -> int:
+        """Of the progress, after the errors."""
+        frames = len(self.results.groups()) if self.options.frame else len(self.scenes)
+        memory = len(self.specs) if self._with_memory() else 0
+        return frames * (1 + self.options.repeats) + len(self._curves()) + len(self.options.growth) + memory
+
+    def _curves(self) -> list[tuple[Scene, int]]:
+        """Each scene with each number of samples that it is thinned to."""
+        if not self.options.curves:
+            return []
+        return [(scene, most) for scene in self.scenes for most in scene.thinned_counts()]
+
+    def _with_memory(self) -> bool:
+        return self.options.memory and measurable()
+
     def _run(self, spec: MethodSpec, source: Path) -> Times:
         method = self.methods[spec.name]
         method.run(source, self.target)
         return method.clock.take()
+
+    def _scores(self, progress: Progress) -> dict[str, dict[str, dict[str, float | None]]]:
+        """Errors of all methods, by scene. A scene that cannot be read, or does not fit, is left out from here on."""
+        scores = {}
+        for scene in _steps(self.scenes, progress, "errors of"):
+            try:
+                scores[scene.name] = dict(self._score(scene))
+            except (InputError, MemoryError) as error:
+                self.gallery.drop(scene.name)
+                self.results.failed[scene.name] = describe_error(error)
+                progress.fail(self.results.failed[scene.name])
+        if not scores:
+            raise InputError(f"{self.options.folder}: no scene is left to measure")
+        self._take([scene for scene in self.scenes if scene.name in scores])
+        return scores
 
     def _score(self, scene: Scene) -> Iterator[tuple[str, dict[str, float | None]]]:
         """Errors of all methods on a scene."""

@@ -58,6 +58,11 @@ class Gallery:
         self.sizes[scene] = shown.shape[1], shown.shape[0]
         self.scenes.setdefault(scene, {})[method] = png(tone_mapped(common_scale(reference) * shown))
 
+    def drop(self, scene: str) -> None:
+        """Forgets the pictures of a scene, if there are any."""
+        self.scenes.pop(scene, None)
+        self.sizes.pop(scene, None)
+
 
 def load_pillow() -> Any:
     """The PIL.Image module. Raises UsageError with what to install."""

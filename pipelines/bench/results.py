@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -20,6 +20,10 @@ from pipelines.bench.methods import OUTSIDE, MethodSpec
 FORMAT = 1
 MEANS = ("smape", "psnr", "ssim", "flip", "energy")
 """Scores averaged over scenes as plain means; relMSEs as geometric ones."""
+FEWEST_TO_RESAMPLE = 5
+"""Scenes below which a bootstrap interval of 95 % is nearly or exactly their range."""
+LEAST_GAIN = 0.02
+"""A method on the Pareto front has less error than every faster one by this share: less is not worth the wait."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +89,8 @@ class Results:
     curve: list[CurvePoint] = field(default_factory=list)
     growth: list[GrowthPoint] = field(default_factory=list)
     memory: dict[str, int] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
+    """Scene that was left out, since it cannot be read -> why."""
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -99,7 +105,7 @@ class Results:
             data["machine"], data["protocol"], [MethodSpec(**row) for row in data["methods"]],
             [SceneInfo(**row) for row in data["scenes"]], [Measurement(**row) for row in data["measurements"]],
             [CurvePoint(**row) for row in data["curve"]], [GrowthPoint(**row) for row in data["growth"]],
-            dict(data["memory"]),
+            dict(data["memory"]), dict(data.get("failed", {})),
         )
 
     def groups(self) -> list[int]:
@@ -128,7 +134,7 @@ class Summary:
 
     scores: Mapping[str, float | None]
     interval: tuple[float, float] | None
-    """95 % bootstrap interval of the relMSE."""
+    """Of the relMSE, see `spread`."""
     cpu: Mapping[str, float]
     wall: Mapping[str, float]
 
@@ -159,8 +165,20 @@ def summarize(rows: list[Measurement]) -> Summary:
             values = [value for row in scored if (value := row[name]) is not None]
             if len(values) == len(scored):
                 scores[name] = float(np.mean(values)) if name in MEANS else geometric_mean(values)
-        interval = bootstrap_interval([row["relmse"] or 0.0 for row in scored])
+        interval = spread([row["relmse"] or 0.0 for row in scored])
     return Summary(scores, interval, _per(rows, "cpu", megapixels), _per(rows, "wall", megapixels))
+
+
+def spread(errors: Sequence[float]) -> tuple[float, float] | None:
+    """95 % bootstrap interval of the errors' geometric mean; of few scenes their range, of one nothing."""
+    if len(errors) < FEWEST_TO_RESAMPLE:
+        return (min(errors), max(errors)) if len(errors) > 1 else None
+    return bootstrap_interval(errors)
+
+
+def spread_name(scenes: int) -> str:
+    """What `spread` is of so many scenes."""
+    return "range" if scenes < FEWEST_TO_RESAMPLE else "interval"
 
 
 def _per(rows: Iterable[Measurement], kind: str, megapixels: float) -> dict[str, float]:
@@ -172,13 +190,13 @@ def _per(rows: Iterable[Measurement], kind: str, megapixels: float) -> dict[str,
 
 
 def pareto(points: Mapping[str, tuple[float, float]]) -> list[str]:
-    """Names of the points (time, error) than which no other is better in one and as good in the other; by time."""
+    """Names of the points (time, error) whose error is below that of every faster one by `LEAST_GAIN`; by time."""
     front: list[str] = []
     best = float("inf")
     for name, (_, error) in sorted(points.items(), key=lambda item: item[1]):
-        if error < best:
+        if error < best * (1.0 - LEAST_GAIN):
             front.append(name)
-            best = error
+        best = min(best, error)
     return front
 
 

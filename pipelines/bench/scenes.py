@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
@@ -13,8 +14,8 @@ from deep_io import DeepSamples, Window, read_deep, write_deep
 from deep_io.errors import InputError
 from deep_io.path_samples import SampleReader
 from model.metrics import common_scale
-from pipelines.compare import FlatPicture, read_rgb
-from pipelines.scene_names import DEEP, REFERENCE, scene_name
+from pipelines.flat_pictures import FlatPicture, read_rgb
+from pipelines.scene_names import DEEP, REFERENCE, reference_of, scene_name
 
 SEED = 20100623
 """Of the order in which samples are left out, the same in every run."""
@@ -53,9 +54,14 @@ class Scene:
 
 
 def find_scenes(folder: Path, match: str = "*") -> list[Scene]:
-    """Every NAME.deep.exr of `folder` that has a NAME.ref.exr, and whose NAME matches the glob, by name.
+    """The scenes of `find_pairs`, opened. Raises InputError, as `find_pairs` and `open_scene` do."""
+    return [open_scene(*pair) for pair in find_pairs(folder, match)]
 
-    Raises InputError when there is no such folder or no such pair, and what `open_scene` raises.
+
+def find_pairs(folder: Path, match: str = "*") -> list[tuple[Path, Path]]:
+    """Every NAME.deep.exr of `folder` that has a NAME.ref.exr, with it, and whose NAME matches the glob, by name.
+
+    Raises InputError when there is no such folder or no such pair.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
@@ -67,7 +73,27 @@ def find_scenes(folder: Path, match: str = "*") -> list[Scene]:
             f"{folder}: no name in common between {len(deep)} files NAME{DEEP} and {len(references)} NAME{REFERENCE} "
             f"that matches {match!r}; a scene is such a pair"
         )
-    return [open_scene(folder / f"{name}{DEEP}", folder / f"{name}{REFERENCE}") for name in names]
+    return [(folder / f"{name}{DEEP}", folder / f"{name}{REFERENCE}") for name in names]
+
+
+def without_reference(folder: Path, match: str = "*") -> list[str]:
+    """The names of the files NAME.deep.exr of `folder` that have no NAME.ref.exr, and whose NAME matches the glob."""
+    return sorted(path.name for path in folder.glob(f"*{DEEP}")
+                  if fnmatch(scene_name(path), match) and not reference_of(path).exists())
+
+
+def open_scenes(pairs: Iterable[tuple[Path, Path]]) -> tuple[list[Scene], dict[str, str]]:
+    """The scenes of pairs, and of those that cannot be opened name and error. Raises InputError where none can."""
+    scenes: list[Scene] = []
+    failed: dict[str, str] = {}
+    for source, reference in pairs:
+        try:
+            scenes.append(open_scene(source, reference))
+        except InputError as error:
+            failed[scene_name(source)] = str(error)
+    if not scenes:
+        raise InputError("; ".join(failed.values()))
+    return scenes, failed
 
 
 def open_scene(source: Path, reference: Path) -> Scene:
@@ -91,7 +117,7 @@ def open_scene(source: Path, reference: Path) -> Scene:
         common_scale(picture.rgb)
     except ValueError as error:
         raise InputError(f"{reference}: {error}") from error
-    return Scene(source.name.removesuffix(DEEP), source, picture, samples, weighting)
+    return Scene(scene_name(source), source, picture, samples, weighting)
 
 
 def thin(samples: DeepSamples, most: int, seed: int = SEED) -> DeepSamples:

@@ -8,13 +8,17 @@ from typing import Any
 
 from pipelines.bench.charts import number
 from pipelines.bench.methods import FAMILIES, OUTSIDE, STAGES
-from pipelines.bench.results import Results, Summary, pareto
+from pipelines.bench.results import LEAST_GAIN, Results, Summary, pareto, spread_name
 
 SMALL_FRAME = 0.2
 """Megapixels of a timed frame below which the page warns of costs that do not grow with it."""
 FULL_HD = 1920 * 1080 / 1e6
 """Megapixels of the frame that times per megapixel are scaled to for a reader."""
 
+STAR = ("★ is on the Pareto front of CPU time and relMSE: its relMSE is at least "
+        f"{100 * LEAST_GAIN:.0f} % below that of every faster method.")
+SPREADS = {"interval": "its 95 % bootstrap interval", "range": "the range of theirs"}
+"""What `spread_name` says, for a reader."""
 INSTALL_OIDN = "OIDN is left out: pyoidn is not installed; install lbmc with its extra 'bench'."
 PUBLISHED = {
     "PIXELGATHER": (0.0352, 0.0353),
@@ -66,13 +70,13 @@ def methods_table(results: Results, samples: int) -> Table:
         rows.append([spec.name + (" ★" if spec.name in front else ""), *_errors(row), *time,
                      "–" if memory is None else f"{memory / 2**20:.0f}"])
     count = len(results.scenes_of(samples))
-    note = "relMSE is the geometric mean over the scenes with its 95 % bootstrap interval, the other errors are means. "
+    note = (f"relMSE is the geometric mean over the scenes with {SPREADS[spread_name(count)]}, the other errors are "
+            "means. ")
     note += (f"Times are of the method's own work (all but {', '.join(OUTSIDE)}), scaled by pixels to 1920 x 1080. "
-             "★ is on the Pareto front of CPU time and relMSE. Untrained networks have random weights, so they have a "
-             "time but no error.")
+             f"{STAR} Untrained networks have random weights, so they have a time but no error.")
     if results.memory:
         note += f" MiB is peak memory on {memory_frames(results)}."
-    errors = ("relMSE", "interval", "trimmed", "SMAPE", "PSNR", "SSIM", "FLIP", "energy")
+    errors = ("relMSE", spread_name(count), "trimmed", "SMAPE", "PSNR", "SSIM", "FLIP", "energy")
     head = ("method", *errors, "CPU s", "wall s", "MiB")
     return Table(f"{count} scene{'s' if count != 1 else ''} with {samples} samples per pixel", head, rows, note)
 
@@ -119,7 +123,9 @@ def savings_table(results: Results) -> Table:
                          _change(row.scores["smape"], base.scores["smape"])])
     head = ("lbmc as it ships, but", "samples", "CPU time", "relMSE", "SMAPE")
     return Table("What savings save and cost", head, rows,
-                 "Changes against the same weights as they ship; a plus is slower or worse.")
+                 "Changes against the same weights as they ship, over all scenes, whether or not the survey chooses so "
+                 "on them; a plus is slower or worse. In lbmc's repository, docs/adapting.md tells chosen from forced "
+                 "and has the other savings; benchmarks/bench_adapting.py measures them.")
 
 
 def growth_table(results: Results) -> Table:
@@ -166,11 +172,20 @@ def protocol_lines(results: Results) -> list[str]:
                      "weighs more than in a film frame; compare methods, do not predict frames.")
     if results.curve:
         lines.append("For fewer samples, each pixel draws its own at random; 2 hold the 1, 4 the 2, and so on.")
+    if protocol.get("without_reference"):
+        lines.append(unpaired_line(protocol["without_reference"]))
+    if results.failed:
+        lines.append(f"Left out, since they cannot be read: {'; '.join(results.failed.values())}.")
     if not protocol["oidn"]:
         lines.append(INSTALL_OIDN)
     if not any(spec.family == "lbmc" for spec in results.methods):
         lines.append("No weights of lbmc ship with this build; name some with --model.")
     return lines
+
+
+def unpaired_line(names: Sequence[str]) -> str:
+    """What is said of deep files without a reference."""
+    return f"Left out, without a NAME.ref.exr beside NAME.deep.exr: {', '.join(names)}."
 
 
 def markdown_report(results: Results) -> str:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +18,16 @@ from deep_io import Window
 from model.metrics import score
 from pipelines.bench.methods import SAVINGS, oidn_installed
 from pipelines.bench.results import Results
-from pipelines.compare import read_rgb
+from pipelines.flat_pictures import read_rgb
 from tests.end_to_end.bench_scenes import write_pair, write_reference
 from tests.end_to_end.scenes import random_weights
 from tests.runner import Finished, Runner, in_process
 
 QUICK = ("--no-paper", "--no-memory", "--no-savings", "--no-curves", "--no-flip", "--repeats", 1, "--frame", 0,
          "--progress", "none")
+
+
+UNPAIRED = "Left out, without a NAME.ref.exr beside NAME.deep.exr: alone.deep.exr."
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +53,7 @@ def report(folder: Path, weights: Path, tmp_path_factory: pytest.TempPathFactory
                      "--no-paper", "--progress", "plain")
     assert run.code == 0, run.err
     assert "Progress: 100%" in run.err
+    assert UNPAIRED in run.err
     assert run.out.startswith("# Speed against error")
     return out
 
@@ -110,6 +116,9 @@ def test_machine_and_protocol_are_stated(results: dict[str, Any], report: Path) 
         assert str(machine[name]) in table
     assert results["protocol"]["repeats"] == 2
     assert "medians" in table
+    assert f"- {UNPAIRED}" in table
+    assert results["protocol"]["without_reference"] == ["alone.deep.exr"]
+    assert results["failed"] == {}
 
 
 def test_fewer_samples_are_measured_too(results: dict[str, Any]) -> None:
@@ -208,6 +217,70 @@ def test_a_folder_without_pairs_is_refused(lbmc: Runner, folder: Path, tmp_path:
     shutil.copy(folder / "first.ref.exr", tmp_path / "other.ref.exr")
     assert_one_line(lbmc("bench", tmp_path, "--out", tmp_path / "out"), str(tmp_path), "no name in common")
     assert not (tmp_path / "out").exists()
+
+
+def truncate(path: Path) -> None:
+    """Is seen when the file is opened."""
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def corrupt(path: Path) -> None:
+    """Is seen only when the last rows are decompressed."""
+    path.write_bytes(path.read_bytes()[:-200] + bytes(200))
+
+
+@pytest.mark.parametrize("size", [0, 40])  # of the frames that are timed: the broken scene's own would be the first
+def test_scenes_that_cannot_be_read_are_left_out_and_the_others_measured(
+    lbmc: Runner, folder: Path, weights: Path, tmp_path: Path, size: int
+) -> None:
+    scenes, out = tmp_path / "scenes", tmp_path / "out"
+    shutil.copytree(folder, scenes)
+    for kind in ("deep", "ref"):
+        shutil.copy(scenes / f"second.{kind}.exr", scenes / f"third.{kind}.exr")
+    corrupt(scenes / "first.deep.exr")
+    truncate(scenes / "third.deep.exr")
+    words = [size if word == 0 else "plain" if word == "none" else word for word in QUICK if word != "--no-curves"]
+    run = lbmc("bench", scenes, "--out", out, "--model", weights, *words)
+    assert run.code == 1
+    lines = run.err.splitlines()
+    first, third = ([line for line in lines if line.startswith(f"ERROR: {scenes / name}.deep.exr: row 23: ")]
+                    for name in ("first", "third"))
+    assert len(first) == len(third) == 1
+    told = [lines.index(line) for line in (*third, *first, "Progress: 100%", "failed scenes:")]
+    assert told == sorted(told)
+    assert lines[-2:] == [line.replace("ERROR:", f"  {name}:") for line, name in ((third[0], "third"),
+                                                                                 (first[0], "first"))]
+    found = json.loads((out / "results.json").read_text("utf-8"))
+    assert [scene["name"] for scene in found["scenes"]] == ["second"]
+    assert {row["scene"] for row in found["measurements"]} == {row["scene"] for row in found["curve"]} == {"second"}
+    assert all(row["scores"] and row["cpu"] for row in found["measurements"])
+    assert set(found["failed"]) == {"third", "first"}
+    line = f"Left out, since they cannot be read: {found['failed']['third']}; {found['failed']['first']}."
+    for name in ("results.md", "report.html"):
+        assert line in html.unescape((out / name).read_text("utf-8"))
+
+
+@pytest.mark.parametrize("harm", [truncate, corrupt])
+def test_of_scenes_that_all_cannot_be_read_nothing_is_written(
+    harm: Callable[[Path], None], folder: Path, weights: Path, tmp_path: Path
+) -> None:
+    scenes, out = tmp_path / "scenes", tmp_path / "out"
+    shutil.copytree(folder, scenes)
+    for name in ("first", "second"):
+        harm(scenes / f"{name}.deep.exr")
+    run = in_process("bench", scenes, "--out", out, "--model", weights, *QUICK)
+    assert run.code == 3
+    for name in ("first", "second"):
+        assert run.err.count(f"{name}.deep.exr: row 23: ") == 1
+    assert harm is truncate or run.err.endswith(f"ERROR: {scenes}: no scene is left to measure\n")
+    assert not out.exists() or not list(out.iterdir())
+
+
+def test_a_file_in_place_of_the_folder_is_refused_with_the_cure(folder: Path, weights: Path, tmp_path: Path) -> None:
+    run = in_process("bench", folder, "--match", "first", "--out", weights, "--model", weights, *QUICK)
+    assert run.code == 3
+    assert "tiny.safetensors: cannot be made a folder" in run.err
+    assert "name another --out" in run.err
 
 
 def test_a_folder_that_is_not_there_is_refused(tmp_path: Path) -> None:

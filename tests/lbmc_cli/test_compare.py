@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from model.metrics import score
+from tests.end_to_end.scenes import noisy_scene, write_scene
 from tests.pipelines.test_compare import picture, write_flat
 from tests.runner import Finished, Runner, in_process
 
@@ -106,14 +107,53 @@ def sequences(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_sequences_give_a_table_of_the_common_frames_and_a_mean(lbmc: Runner, sequences: Path) -> None:
-    run = lbmc("compare", sequences / "image.####.exr", sequences / "reference.####.exr", "--no-flip")
+def test_sequences_give_a_table_and_both_kinds_of_means(lbmc: Runner, sequences: Path) -> None:
+    run = lbmc("compare", sequences / "image.####.exr", sequences / "reference.####.exr", "--no-flip", "--frames",
+               "1002-1004")
     assert run.code == 0
-    names = [line.split()[0] for line in run.out.splitlines()[1:]]
-    assert names == ["image.1002.exr", "image.1003.exr", "image.1004.exr", "mean"]
-    errors = [score(picture(n), picture(n + 9), with_flip=False).relmse for n in range(1002, 1005)]
-    mean = float(run.out.splitlines()[-1].split()[1])
-    assert mean == pytest.approx(float(np.exp(np.mean(np.log(errors)))), rel=1e-4)
+    head, *rows = run.out.splitlines()
+    names = [line.split("  ")[0] for line in rows]
+    assert names == ["image.1002.exr", "image.1003.exr", "image.1004.exr", "geometric mean", "mean"]
+    expected = [score(picture(n), picture(n + 9), with_flip=False) for n in range(1002, 1005)]
+    columns = head.split()
+    geometric, plain = (dict(zip(columns, row.removeprefix(name).split(), strict=True))
+                        for name, row in zip(names[-2:], rows[-2:], strict=True))
+    assert float(geometric["relmse"]) == pytest.approx(np.exp(np.mean([np.log(s.relmse) for s in expected])), rel=1e-4)
+    assert float(plain["smape"]) == pytest.approx(np.mean([s.smape for s in expected]), rel=1e-4)
+    assert {name for name in columns if geometric[name] != "–"} == {"relmse", "trimmed", "small_epsilon"}
+    assert {name for name in columns if plain[name] == "–"} == {"relmse", "trimmed", "small_epsilon"}
+
+
+def test_frames_that_a_sequence_lacks_are_told_and_no_success(lbmc: Runner, sequences: Path) -> None:
+    image, reference = sequences / "image.####.exr", sequences / "reference.####.exr"
+    run = lbmc("compare", image, reference, "--no-flip", "--json")
+    assert run.code == 1
+    note, *_, summary = run.err.splitlines()
+    assert note == (f"2 of 5 frames are left out: {image} lacks 1005; {reference} lacks 1001; "
+                    "pass --frames to name those to compare")
+    assert summary.startswith("3 of 5 frames done, 2 left out, ")
+    found = json.loads(run.out)
+    assert [Path(row["image"]).name for row in found["images"]] == [f"image.{n}.exr" for n in (1002, 1003, 1004)]
+    assert found["failed"] == []
+    assert found["left_out"] == [
+        {"frame": "image.1001.exr", "error": f"{sequences / 'reference.1001.exr'}: no such file"},
+        {"frame": "image.1005.exr", "error": f"{sequences / 'image.1005.exr'}: no such file"},
+    ]
+
+
+def test_frames_that_are_named_are_all_that_counts(sequences: Path) -> None:
+    reference = sequences / "reference.####.exr"
+    for words in ((sequences / "image.####.exr", reference, "--frames", "1003-1004"),
+                  (sequences / "image.1003-1004####.exr", reference)):
+        run = in_process("compare", *words, "--no-flip", "--json")
+        assert run.code == 0, run.err
+        assert "left out" not in run.err
+        assert len(json.loads(run.out)["images"]) == 2
+    run = in_process("compare", sequences / "image.####.exr", reference, "--frames", "1001-1002", "--no-flip", "--json")
+    assert run.code == 1
+    (failed,) = json.loads(run.out)["failed"]
+    assert failed["frame"] == "image.1001.exr"
+    assert "reference.1001.exr" in failed["error"]
 
 
 def test_a_frame_that_fails_is_listed_and_the_others_are_measured(sequences: Path) -> None:
@@ -122,6 +162,7 @@ def test_a_frame_that_fails_is_listed_and_the_others_are_measured(sequences: Pat
     run = in_process(*words)
     assert run.code == 1
     assert len(json.loads(run.out)["images"]) == 2
+    assert [row["frame"] for row in json.loads(run.out)["failed"]] == ["image.1003.exr"]
     assert "failed frames:" in run.err
     assert "1 failed" in run.err
 
@@ -135,21 +176,23 @@ def test_both_halves_of_a_frame_are_needed(sequences: Path) -> None:
     write_flat(sequences / "half.1003.exr", picture(7))
     words = ("compare", sequences / "image.####.exr", sequences / "reference.####.exr", "--no-flip", "--other-half")
     run = in_process(*words, sequences / "half.####.exr", "--json")
-    assert run.code == 0, run.err
+    assert run.code == 1
+    assert "4 of 5 frames are left out" in run.err
+    assert "half.####.exr lacks 1001-1002,1004-1005" in run.err
     (found,) = json.loads(run.out)["images"]
     assert found["image"].endswith("image.1003.exr")
     expected = score(picture(1003), picture(1012), picture(7), with_flip=False).relmse_unbiased
     assert found["relmse_unbiased"] == pytest.approx(expected)
     run = in_process(*words, sequences / "none.####.exr")
     assert run.code == 3
-    assert "none.####.exr have no frame in common" in run.err
+    assert "none.####.exr: no file matches the pattern" in run.err
 
 
 def test_sequences_write_a_picture_per_frame(sequences: Path) -> None:
     words = ("compare", sequences / "image.####.exr", sequences / "reference.####.exr", "--no-flip", "--heatmap")
     refused = in_process(*words, sequences / "error.png")
     assert refused.code == 2
-    assert in_process(*words, sequences / "error.####.png").code == 0
+    assert in_process(*words, sequences / "error.####.png", "--frames", "1002-1004").code == 0
     assert sorted(path.name for path in sequences.glob("error*")) == [f"error.{n}.png" for n in range(1002, 1005)]
 
 
@@ -187,9 +230,36 @@ def test_a_single_image_has_no_sequence_of_references(sequences: Path) -> None:
 
 
 def test_sequences_without_a_common_frame_are_refused(sequences: Path) -> None:
+    write_flat(sequences / "else.0001.exr", picture(0))
     run = in_process("compare", sequences / "image.####.exr", sequences / "else.####.exr")
     assert run.code == 3
     assert "no frame in common" in run.err
+
+
+def test_folders_are_refused_with_what_does_compare_them(lbmc: Runner, sequences: Path, tmp_path: Path) -> None:
+    for words in ((sequences, tmp_path), (sequences / "image.1002.exr", sequences)):
+        assert_one_line(lbmc("compare", *words), f"{sequences}: is a folder", "NAME.####.exr", "lbmc bench DIR")
+
+
+def test_a_deep_file_is_refused_with_the_command_that_flattens_it(lbmc: Runner, pair: tuple[Path, Path]) -> None:
+    deep = pair[0].with_name("shot.deep.exr")
+    write_scene(deep, noisy_scene(1))
+    assert_one_line(lbmc("compare", deep, pair[1]), f"{deep}: is a deep EXR", f"lbmc denoise {deep} OUT")
+
+
+def test_a_layer_can_be_chosen(lbmc: Runner, pair: tuple[Path, Path], tmp_path: Path) -> None:
+    names = ("beauty.R", "beauty.G", "beauty.B")
+    image = write_flat(tmp_path / "layer.exr", picture(0), names=names)
+    assert_one_line(lbmc("compare", image, pair[1]), "layer.exr: no R, G, B channels", "--layer beauty")
+    run = lbmc("compare", image, pair[1], "--layer", "beauty", "--part", "0", "--no-flip", "--json")
+    assert run.code == 0, run.err
+    (found,) = json.loads(run.out)["images"]
+    assert found["relmse"] == pytest.approx(score(picture(0), picture(1)).relmse)
+
+
+def test_two_halves_that_are_one_file_are_refused(lbmc: Runner, pair: tuple[Path, Path]) -> None:
+    run = lbmc("compare", *pair, "--other-half", pair[1])
+    assert_one_line(run, f"{pair[1]} and {pair[1]} are the same picture; two independent renderings are needed")
 
 
 @pytest.mark.parametrize("debug", [False, True])

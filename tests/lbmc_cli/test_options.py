@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import click
@@ -168,8 +169,22 @@ def test_a_wrong_value_from_the_environment_names_its_variable() -> None:
     assert "environment" not in in_process(*words, "--memory", "much", env={"LBMC_MEMORY": "2GiB"}).err
 
 
-@pytest.mark.parametrize("words", [["--threads", "100000"], ["--device", "cuda:99999999999999999999"]])
-def test_numbers_that_crash_the_libraries_are_refused(words: list[str]) -> None:
-    run = in_process("denoise", "in.exr", "out.exr", *words)
+@pytest.mark.parametrize(
+    "words",
+    [
+        "denoise in.exr out.exr --device cuda:99999999999999999999",
+        "denoise in.exr out.exr --threads 100000",
+        "export-layers in.exr out.exr --threads 100000",
+        "pack in.exr out.exr --threads 100000",
+        "bench scenes --threads 100000",
+        "train scenes out --validation held --threads 100000",
+        "train scenes out --validation held --loaders 100000",
+        "render out --threads 100000",
+        "render out --workers 100000",
+    ],
+)
+def test_numbers_that_crash_the_libraries_are_refused(words: str, tmp_path: Path) -> None:
+    run = in_process(*words.split(), cwd=tmp_path)
     assert run.code == 2
-    assert words[0] in run.err
+    assert f"Invalid value for '{words.split()[-2]}'" in run.err
+    assert not list(tmp_path.iterdir())

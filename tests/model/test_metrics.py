@@ -123,6 +123,15 @@ def test_ssim_of_an_image_smaller_than_its_window_is_not_a_number() -> None:
 def test_a_black_reference_is_refused() -> None:
     with pytest.raises(ValueError, match="no light"):
         metrics.score(np.ones((4, 4, 3)), np.zeros((4, 4, 3)))
+    with pytest.raises(ValueError, match="no light in it: no value is above 0"):
+        metrics.common_scale(np.full((4, 4, 3), -1.0))
+
+
+def test_a_reference_whose_negative_values_outweigh_its_light_is_not_called_dark() -> None:
+    reference = np.full((4, 4, 3), -1.0)
+    reference[0] = 2.0
+    with pytest.raises(ValueError, match=r"mean is -0\.25, .*negative values outweigh its light"):
+        metrics.common_scale(reference)
 
 
 def test_sizes_that_differ_are_both_named() -> None:

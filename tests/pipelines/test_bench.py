@@ -25,8 +25,8 @@ from pipelines.bench.memory import measurable, peak_memory
 from pipelines.bench.methods import MethodSpec, make, method_specs
 from pipelines.bench.report import Gallery
 from pipelines.bench.results import Measurement, Results, SceneInfo, pareto
-from pipelines.bench.scenes import enlarge, find_scenes, thin, write_enlarged, write_thinned
-from pipelines.bench.tables import memory_frames
+from pipelines.bench.scenes import enlarge, find_scenes, thin, without_reference, write_enlarged, write_thinned
+from pipelines.bench.tables import memory_frames, methods_table, savings_table
 from tests.deep_io.deep_files import openexr_part, write_openexr
 from tests.end_to_end.bench_scenes import WINDOW, write_pair
 from tests.end_to_end.scenes import noisy_scene
@@ -155,6 +155,9 @@ def test_scenes_are_chosen_by_name(tmp_path: Path) -> None:
     for name in ("indoor-a", "outdoor-b"):
         write_pair(tmp_path, name, 1)
     assert [scene.name for scene in find_scenes(tmp_path, "out*")] == ["outdoor-b"]
+    (tmp_path / "outdoor-b.ref.exr").rename(tmp_path / "outdoor-c.ref.exr")
+    assert without_reference(tmp_path) == ["outdoor-b.deep.exr"]
+    assert without_reference(tmp_path, "in*") == []
     with pytest.raises(InputError, match=r"no name in common .* 'none\*'"):
         find_scenes(tmp_path, "none*")
 
@@ -163,6 +166,45 @@ def test_the_front_holds_what_nothing_beats() -> None:
     points = {"slow, good": (9.0, 0.1), "fast, bad": (1.0, 0.9), "beaten": (3.0, 0.95), "middle": (4.0, 0.5),
               "as good, slower": (5.0, 0.5)}
     assert pareto(points) == ["fast, bad", "middle", "slow, good"]
+
+
+def test_the_front_holds_nothing_that_is_hardly_better_than_what_is_faster() -> None:
+    points = {"fast": (1.0, 0.5), "1 % better": (2.0, 0.495), "2.5 % better": (3.0, 0.4875), "perfect": (9.0, 0.0),
+              "also": (10.0, 0.0)}
+    assert pareto(points) == ["fast", "perfect"]  # the third is 1.5 % better than the second, which is faster
+    del points["1 % better"]
+    assert pareto(points) == ["fast", "2.5 % better", "perfect"]
+
+
+def scored(count: int) -> Results:
+    """A method on so many scenes, with relMSEs of 0.01, 0.02, ..."""
+    scenes = [SceneInfo(f"s{n}", 10, 10, 8) for n in range(count)]
+    rows = [Measurement(scene.name, "m", {"relmse": 0.01 * n, "smape": 0.1}, {"filter": 1.0}, {"filter": 1.0}, 1.0)
+            for n, scene in enumerate(scenes, 1)]
+    return Results({}, {}, [MethodSpec("m", "classical", "blur")], scenes, rows)
+
+
+def test_few_scenes_have_a_range_and_no_interval() -> None:
+    one, few, many = (methods_table(scored(count), 8) for count in (1, 4, 5))
+    assert (few.head[2], many.head[2]) == ("range", "interval")
+    assert few.rows[0][2] == "0.0100 to 0.0400"
+    low, high = (float(word) for word in many.rows[0][2].split(" to "))
+    assert 0.01 < low < 0.026 < high < 0.05  # around the geometric mean, within the range
+    assert one.rows[0][2] == "–"
+    assert "bootstrap" not in one.note + few.note
+    assert "95 % bootstrap interval" in many.note
+
+
+def test_the_table_says_who_gets_a_star() -> None:
+    table = methods_table(scored(2), 8)
+    assert table.rows[0][0] == "m ★"
+    assert "at least 2 % below that of every faster method" in table.note
+
+
+def test_what_savings_are_averaged_over_is_said() -> None:
+    note = savings_table(scored(2)).note
+    for word in ("all scenes", "docs/adapting.md", "benchmarks/bench_adapting.py"):
+        assert word in note
 
 
 def test_means_are_per_megapixel_and_geometric_for_relmse() -> None:

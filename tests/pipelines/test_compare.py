@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,14 @@ import OpenEXR
 import pytest
 
 from deep_io import DeepSamples, InputError, Window, write_deep
+from deep_io.flat import FlatImage, write_flat_parts
 from model.metrics import score
 from pipelines.compare import compare, mean_scores, score_lines, scores_as_dict
+from pipelines.flat_pictures import read_rgb
 
 
-def write_flat(path: Path, rgb: np.ndarray, corner: tuple[int, int] = (0, 0), names: str = "RGB") -> Path:
-    """A flat scanline EXR of float channels whose data window starts at `corner` (x, y)."""
+def write_flat(path: Path, rgb: np.ndarray, corner: tuple[int, int] = (0, 0), names: Sequence[str] = "RGB") -> Path:
+    """A flat scanline EXR of float channels (H, W, of `names`) whose data window starts at `corner` (x, y)."""
     height, width = rgb.shape[:2]
     window = (np.array(corner, np.int32), np.array([corner[0] + width - 1, corner[1] + height - 1], np.int32))
     header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION, "dataWindow": window}
@@ -78,10 +81,53 @@ def test_a_file_without_colour_is_refused(tmp_path: Path) -> None:
         compare(image, write_flat(tmp_path / "b.exr", picture(1)))
 
 
+def test_a_layer_is_read_where_it_is_and_a_picture_alone_as_it_is(tmp_path: Path) -> None:
+    names = ("R", "G", "B", "diffuse.R", "diffuse.G", "diffuse.B", "id.x")
+    channels = np.concatenate([picture(0), picture(1), picture(2)[..., :1]], axis=-1)
+    layers = write_flat(tmp_path / "layers.exr", channels, names=names)
+    plain = write_flat(tmp_path / "plain.exr", picture(3))
+    np.testing.assert_array_equal(read_rgb(layers).rgb, picture(0))
+    np.testing.assert_array_equal(read_rgb(layers, layer="diffuse").rgb, picture(1))
+    np.testing.assert_array_equal(read_rgb(plain, part="beauty", layer="diffuse").rgb, picture(3))
+    assert compare(layers, plain, layer="diffuse").scores == score(picture(1), picture(3))
+    with pytest.raises(InputError, match=r"layers.exr: no layer 'id' with a colour; its layers are diffuse"):
+        read_rgb(layers, layer="id")  # not the beauty, silently
+
+
+def test_a_part_is_found_by_name_number_and_layer(tmp_path: Path) -> None:
+    def part(seed: int, name: str, layer: str = "") -> FlatImage:
+        return FlatImage.of({f"{layer}{c}": picture(seed)[..., i] for i, c in enumerate("RGB")}, name=name)
+
+    path = tmp_path / "parts.exr"
+    write_flat_parts(path, [part(0, "first", "key."), part(1, "second"), part(2, "third")])
+    for words, seed in (({}, 1), ({"part": "third"}, 2), ({"part": "2"}, 2), ({"layer": "key"}, 0),
+                        ({"part": "first", "layer": "key"}, 0)):
+        np.testing.assert_array_equal(read_rgb(path, **words).rgb, picture(seed))
+    with pytest.raises(InputError, match="has no part 'none'; its parts are first, second, third"):
+        read_rgb(path, "none")
+    for words in ({"layer": "none"}, {"part": "second", "layer": "key"}):
+        with pytest.raises(InputError, match="no layer '.*' with a colour"):
+            read_rgb(path, **words)
+
+
+def test_a_file_whose_colour_is_a_layers_says_how_to_take_it(tmp_path: Path) -> None:
+    path = write_flat(tmp_path / "layer.exr", picture(0), names=("beauty.R", "beauty.G", "beauty.B"))
+    with pytest.raises(InputError, match=r"no R, G, B channels \(its channels: beauty.B, .*\); .*--layer beauty"):
+        read_rgb(path)
+
+
+@pytest.mark.parametrize("copy", [False, True])
+def test_halves_that_are_one_picture_are_refused(copy: bool, tmp_path: Path) -> None:
+    image, reference = write_flat(tmp_path / "a.exr", picture(0)), write_flat(tmp_path / "b.exr", picture(1))
+    half = write_flat(tmp_path / "c.exr", picture(1)) if copy else reference
+    with pytest.raises(InputError, match=f"b.exr and .*{half.name} are the same picture; two independent"):
+        compare(image, reference, half)
+
+
 def test_a_deep_file_is_refused(tmp_path: Path) -> None:
     channels: dict[str, np.ndarray] = {name: np.ones(1, np.float16) for name in "RGB"}
     write_deep(tmp_path / "a.exr", DeepSamples(np.ones((1, 1), np.int32), channels, Window(0, 0, 0, 0)))
-    with pytest.raises(InputError, match="a.exr: is a deep EXR"):
+    with pytest.raises(InputError, match=r"a.exr: is a deep EXR where a flat one is needed; lbmc denoise \S*a.exr OUT"):
         compare(tmp_path / "a.exr", tmp_path / "a.exr")
 
 

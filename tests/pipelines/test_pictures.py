@@ -14,6 +14,7 @@ from pipelines.pictures import (
     diverging_colors,
     heat_map,
     panel,
+    panel_figure,
     pooled,
     signed_error,
     worst_regions,
@@ -134,6 +135,12 @@ def test_the_overview_of_a_panel_loses_no_thin_line() -> None:
     top = drawn[40:60, drawn.shape[1] * 63 // 100 : -100]
     red = (top[..., 0] > top[..., 2] + 30).mean(axis=0) > 0.9
     assert np.count_nonzero(np.diff(red.astype(int)) == 1) == 8
+
+
+def test_the_scale_of_a_panel_says_what_its_colours_mean() -> None:
+    image, reference = pair()
+    labels = [axes.get_ylabel() for axes in panel_figure({"image": image}, reference).axes]
+    assert "relative error: blue too dark, red too bright" in labels
 
 
 @pytest.mark.parametrize("shape", [(40, 60), (1, 1), (2, 90)])
