@@ -25,10 +25,10 @@ from model.config import Config
 from model.cost import count
 from model.metrics import common_scale, relmse, relmse_trimmed, smape
 from pipelines.allocator import keep_freed_memory
-from pipelines.bench.methods import LbmcMethod
+from pipelines.bench.methods import BlurMethod, FlatMethod, LbmcMethod, Method
 from pipelines.bench.results import own
 from pipelines.bench.scenes import find_scenes, write_thinned
-from pipelines.compare import read_rgb
+from pipelines.flat_pictures import read_rgb
 from pipelines.scene_names import reference_of
 from pipelines.training.batches import random_batch
 from pipelines.training.cache import SampleCache, SceneArrays, SceneEntry
@@ -118,9 +118,19 @@ def thinned(sets: dict[str, Path], folder: Path) -> dict[str, Scenes]:
     return found
 
 
-def scores(weights: Path, sets: dict[str, Scenes], folder: Path) -> tuple[Row, float]:
-    """Errors on every scene, through the same door as the command, and the network's CPU seconds a megapixel."""
-    method = LbmcMethod(str(weights), torch.get_num_threads(), {"adapt": False})
+def network(weights: Path) -> LbmcMethod:
+    """The network of a weight file, through the same door as the command."""
+    return LbmcMethod(str(weights), torch.get_num_threads(), {"adapt": False})
+
+
+def untrained(sets: dict[str, Scenes], folder: Path) -> Row:
+    """Errors of what needs no training, by name: rows that any network should be ahead of."""
+    methods = {"samples' mean": FlatMethod, "clamp and blur": BlurMethod}
+    return {name: {"scenes": scores(kind(torch.get_num_threads()), sets, folder)[0]} for name, kind in methods.items()}
+
+
+def scores(method: Method, sets: dict[str, Scenes], folder: Path) -> tuple[Row, float]:
+    """Errors on every scene, and the method's own CPU seconds a megapixel."""
     found: Row = {}
     pixels = 0
     for name, scenes in sets.items():
@@ -183,6 +193,9 @@ def perform(description: str, runs: Iterable[Run], rows: Path,
     if options.json.exists():
         document = json.loads(options.json.read_text("utf-8"))
     document["scenes"] = document["scenes"] or [entry.name for entry in cache.entries]
+    if "untrained" not in document:
+        document["untrained"] = untrained(sets, options.work)
+        write(options.json, document)
     for run in runs:
         wanted = any(fnmatch(run.name, glob) for glob in options.only or ["*"])
         if run.key in document["rows"] or not wanted or options.seed not in (None, run.recipe.seed):
@@ -193,7 +206,7 @@ def perform(description: str, runs: Iterable[Run], rows: Path,
         weights = options.work / f"{run.key}{zoo.SUFFIX}"
         zoo.save(trainer.averaged, weights, {"description": f"{run.name}, reduced width", "steps": run.recipe.steps})
         begun = time.process_time()
-        row = {**row_of(run, seconds, *scores(weights, sets, options.work)), **more(weights, run, sets)}
+        row = {**row_of(run, seconds, *scores(network(weights), sets, options.work)), **more(weights, run, sets)}
         document["rows"][run.key] = row
         write(options.json, document)
         print(f"{run.key}: {seconds:.2f} CPU s a step, scored in {time.process_time() - begun:.0f}", flush=True)

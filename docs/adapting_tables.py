@@ -15,9 +15,11 @@ RESULTS = Path(__file__).resolve().parent / "results" / "adapting.json"
 
 
 def savings() -> str:
-    """One row for each saving: time saved, error added, where the survey chooses it and where it is forced."""
+    """Rows of each saving together: time saved, error added, where the survey chooses it and where it is forced."""
+    rows = json.loads(RESULTS.read_text("utf-8"))["rows"]
+    labels = list(dict.fromkeys(row["label"] for row in rows))
     head = ("saving", "scenes", "number", "network's time saved", "relMSE (worst)", "largest change elsewhere")
-    return markdown(head, (_line(row) for row in json.loads(RESULTS.read_text("utf-8"))["rows"]))
+    return markdown(head, (_line(row) for row in sorted(rows, key=lambda row: labels.index(row["label"]))))
 
 
 def _line(row: Mapping[str, Any]) -> list[str]:

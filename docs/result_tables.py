@@ -165,12 +165,18 @@ def paper_rows(names: Sequence[str]) -> list[Row]:
     return [rows[name] for name in names if name in rows]
 
 
+def untrained_rows(columns: int) -> list[list[str]]:
+    """What needs no training, before the networks of a table with so many columns."""
+    found = [[name, *errors_of(row)] for name, row in load(PAPER)["untrained"].items()]
+    return [row + ["–"] * (columns - len(row)) for row in found]
+
+
 def variants() -> str:
     """Table 1, and with it Table 4: OPTIMIZED against LAYER."""
+    head = ("network", *ERRORS, "multiply-adds per pixel", "CPU s a step", "relMSE as published", "SMAPE as published")
     rows = [[row["name"], *errors_of(row), f"{row['multiply_adds'] / 1e3:.0f} k", f"{row['cpu_seconds_a_step']:.2f}",
              *(f"{value:.4f}" for value in PUBLISHED[row["name"]])] for row in paper_rows(list(PUBLISHED))]
-    return markdown(("network", *ERRORS, "multiply-adds per pixel", "CPU s a step", "relMSE as published",
-                     "SMAPE as published"), rows)
+    return markdown(head, [*untrained_rows(len(head)), *rows])
 
 
 def layer_counts() -> str:

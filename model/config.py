@@ -193,6 +193,7 @@ FAST = Config(
     divisor_features=4,
     filtered_guides=True,
     glare_per_level=1.0,
+    glare_in_cells=0.25,
 )
 
 CONFIGS: Mapping[str, Config] = {
