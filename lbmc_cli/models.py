@@ -22,6 +22,6 @@ def models(as_json: bool) -> None:
         return
     for preset in found:
         name = f"{preset.name} (default)" if preset.default else preset.name
-        click.echo(f"{name:<20}{preset.bytes / 1e6:6.1f} MB  {preset.digest}  {preset.info.get('description', '')}")
+        click.echo(f"{name:<20}{preset.bytes / 1e6:6.1f} MB  {preset.digest}  {preset.description}")
     if not found:
         click.echo("no presets are installed; pass a .safetensors file to --model")

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
@@ -19,18 +21,24 @@ SUFFIX = ".safetensors"
 METADATA_KEY = "lbmc"
 FORMAT = 1
 DEFAULT_PRESET = "fast"
+MIRRORED: Mapping[str, str] = MappingProxyType({"best": "fast"})
+"""Presets without a file of their own: the preset whose weights run on the frame and its mirror images, averaged."""
 
 
 def presets() -> list[str]:
     """Names of the presets that ship, sorted."""
-    return sorted(path.stem for path in WEIGHTS.glob(f"*{SUFFIX}"))
+    files = {path.stem for path in WEIGHTS.glob(f"*{SUFFIX}")}
+    return sorted(files | {name for name, weights in MIRRORED.items() if weights in files})
 
 
 def weight_path(name: str | None = None) -> Path:
-    """The file of a preset, of a .safetensors file, or (None) of the default preset. Raises ValueError without one."""
+    """The file of a preset's weights, a .safetensors file, or (None) that of the default preset.
+
+    Raises ValueError without one.
+    """
     if name is None:
         name = DEFAULT_PRESET
-    path = Path(name) if name.endswith(SUFFIX) else WEIGHTS / f"{name}{SUFFIX}"
+    path = Path(name) if name.endswith(SUFFIX) else WEIGHTS / f"{MIRRORED.get(name, name)}{SUFFIX}"
     if not path.is_file():
         if name.endswith(SUFFIX):
             raise ValueError(f"{path}: no such weight file")

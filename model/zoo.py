@@ -17,7 +17,16 @@ from safetensors.torch import save as serialize
 
 from model.config import Config
 from model.denoiser import Denoiser
-from model.weight_files import FORMAT, METADATA_KEY, SUFFIX, digest_of, presets, read_document, weight_path
+from model.weight_files import (
+    FORMAT,
+    METADATA_KEY,
+    MIRRORED,
+    SUFFIX,
+    digest_of,
+    presets,
+    read_document,
+    weight_path,
+)
 
 __all__ = ["SUFFIX", "Weights", "find", "list_models", "presets", "save"]
 
@@ -26,15 +35,18 @@ __all__ = ["SUFFIX", "Weights", "find", "list_models", "presets", "save"]
 class Weights:
     """One weight file and what its metadata says.
 
-    name : preset name, the file's stem
+    name : of the preset, or the file's stem
+    path : the file, which may be another preset's
     config : the network's
     info : "description", "recipe", "data", "steps", "scores": whatever training wrote down
+    mirrored : whether results are averaged over the frame and its mirror images
     """
 
     name: str
     path: Path
     config: Config
     info: dict[str, Any]
+    mirrored: bool = False
 
     @cached_property
     def digest(self) -> str:
@@ -61,7 +73,10 @@ def find(name: str | None = None) -> Weights:
     """
     path = weight_path(name)
     document = read_document(path)
-    return Weights(path.stem, path, Config.from_dict(document["config"]), document["info"])
+    config, info = Config.from_dict(document["config"]), document["info"]
+    if name is not None and name in MIRRORED:
+        return Weights(name, path, config, info, mirrored=True)
+    return Weights(path.stem, path, config, info)
 
 
 def list_models() -> list[Weights]:

@@ -34,6 +34,7 @@ from pipelines.ids import IdChannel, find_ids, ranked_ids
 from pipelines.inference import FrameLayers, denoise_bands
 from pipelines.jobs import FrameSkippedError, JobReport, run_frames
 from pipelines.keep import BEAUTY, WRITTEN, find_kept, kept_channels
+from pipelines.mirrors import ALL_FOUR, ALONE
 from pipelines.network import choose_device, find_weights, load_network, product_dtype
 from pipelines.options import DenoiseOptions
 from pipelines.plan import FramePlan, Shot, fit, roles_of, writers
@@ -61,6 +62,7 @@ class Job:
     def __init__(self, options: DenoiseOptions) -> None:
         self.options = options
         self.weights = find_weights(options.model)
+        self.mirrors = ALL_FOUR if self.weights.mirrored else ALONE
         self.device = choose_device(options.device)
         if options.threads is not None:
             torch.set_num_threads(options.threads)
@@ -101,7 +103,8 @@ class Job:
         written = writers(name, self.written(aovs, ids))
         kept = find_kept(reader.header, reader.weighting, self.options.keep, name, written)
         reader.carry(aovs.channels("light"), aovs.channels("data"))
-        room = fit(reader, self.net, self.options.layers or self.net.config.layers, self.memory)
+        room = fit(reader, self.net, self.options.layers or self.net.config.layers, self.memory,
+                   self.weights.mirrored, self.beside(reader))
         if room.keep and not self.options.dry_run:
             reader.keep()
         rows = 0
@@ -127,7 +130,18 @@ class Job:
             raise UsageError(f"--aov {aovs.depth}: {self.weights.name} was trained without depth; choose another model")
         reader.forget(reader.mapping.sources.keys() - {*roles, "coverage"})
         return FramePlan(source, seen, shot, roles, room.bands, room.memory, reader.mapping, aovs, ids,
-                         kept, held & {*present}, self.options.adapt)
+                         kept, held & {*present}, self.options.adapt, self.model)
+
+    @property
+    def model(self) -> str:
+        """For a reader."""
+        weights = self.weights
+        runs = f", the mean of {len(self.mirrors)} runs of {weights.path.stem} on the frame and its mirror images"
+        return f"{weights.name}{runs if weights.mirrored else ''}"
+
+    def beside(self, reader: FrameReader) -> int:
+        """Bytes that a frame takes besides what every job holds of one."""
+        return 0
 
     def _decide(self, source: Path, seen: Survey, weighting: str) -> Shot:
         """The shot's scale, both numbers of it, comes from one frame: chunks of a shot that name it agree exactly."""
@@ -207,7 +221,7 @@ class Job:
                 update: Callable[[float], None]) -> int:
         """Denoises a frame and writes the files wanted; returns how many values were clamped to half's range."""
         layers = denoise_bands(reader, self.net, plan.shot.scale, plan.roles, plan.shot.layers, plan.bands, update,
-                               plan.held, plan.survey.cells if plan.adapt else None)
+                               plan.held, plan.survey.cells if plan.adapt else None, self.mirrors)
         return self.write(frame, wanted, plan, layers, reader.header)
 
     def written(self, aovs: Aovs, ids: Sequence[IdChannel]) -> list[tuple[str, Iterable[str]]]:

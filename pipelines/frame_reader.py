@@ -1,4 +1,4 @@
-"""An input frame that is decoded once: what the survey has read can be kept for the network.
+"""An input frame that is decoded once, for all its mirror images: what the survey has read can be kept.
 
 Whether there is room for it is the job's decision, which knows the memory budget.
 """
@@ -13,6 +13,7 @@ from deep_io.csr import Index, offsets_of
 from deep_io.deep_reader import DEFAULT_BLOCK_BYTES
 from deep_io.path_samples import PathSamples, SampleReader
 from deep_io.roles import ROLES
+from pipelines.mirrors import STRAIGHT, Mirror
 
 
 class FrameReader(SampleReader):
@@ -23,6 +24,7 @@ class FrameReader(SampleReader):
 
     _keeping = False
     _whole: PathSamples | None = None
+    _mirror = STRAIGHT  # which of its images the kept frame is
 
     def keep(self) -> None:
         """From now on a frame that is read to its end by `blocks` stays in memory."""
@@ -49,8 +51,20 @@ class FrameReader(SampleReader):
         if self._whole is None:
             return super().read(y0, y1)
         window = self.header.data_window
-        return self._rows((window.ymin if y0 is None else y0) - window.ymin,
-                          (window.ymax + 1 if y1 is None else y1) - window.ymin)
+        return self.read_mirrored(window.ymin if y0 is None else y0, window.ymax + 1 if y1 is None else y1, STRAIGHT)
+
+    def read_mirrored(self, y0: int, y1: int, mirror: Mirror) -> PathSamples:
+        """Rows y0 to y1, exclusive, of a mirror image of the frame. `window` and `source` are those of the file's rows.
+
+        A kept frame is turned in place: what was read of its other images is of no use any more.
+        """
+        top, height = self.header.data_window.ymin, self.header.data_window.height
+        if self._whole is None:
+            first, last = mirror.rows(y0 - top, y1 - top, height)
+            return mirror.turn(super().read(top + first, top + last))
+        if mirror != self._mirror:
+            self._whole, self._mirror = self._mirror.to(mirror).turn(self._whole), mirror
+        return self._rows(y0 - top, y1 - top)
 
     def forget(self, roles: Collection[str]) -> None:
         """Frees what is kept of some roles, which nobody will read."""
@@ -86,7 +100,7 @@ class FrameReader(SampleReader):
         return np.concatenate(parts)
 
     def _rows(self, first: int, last: int) -> PathSamples:
-        """Rows of the kept frame, counted from its top; the arrays are views."""
+        """Rows of the kept frame as it is turned, counted from its top; the arrays are views."""
         whole = self._whole
         assert whole is not None
         height, width = whole.counts.shape
@@ -94,14 +108,15 @@ class FrameReader(SampleReader):
             raise ValueError(f"rows {first} to {last} are not within 0 to {height}")
         offsets = offsets_of(whole.counts)
         own = slice(int(offsets[first * width]), int(offsets[last * width]))
+        top, bottom = self._mirror.rows(first, last, height)
         source = whole.source
         if source is not None:
-            before = self.samples_per_row[:first].sum()
+            before = self.samples_per_row[:top].sum()
             source = np.where(source[own] < 0, source[own], source[own] - before)
         return PathSamples(
             whole.counts[first:last], whole.weight[own], whole.coverage[own],
             {role: values[own] for role, values in whole.roles.items()},
-            whole.window.rows(whole.window.ymin + first, whole.window.ymin + last),
+            whole.window.rows(whole.window.ymin + top, whole.window.ymin + bottom),
             extra=whole.extra[own] if self.carried else whole.extra,
             source=source,
         )

@@ -6,20 +6,24 @@ The only place where deep_io's arrays become the model's tensors. Which files, a
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from deep_io.path_samples import PathSamples, SampleReader
+from deep_io.path_samples import PathSamples
 from model.compositing import Layers, fill_holes
 from model.denoiser import Denoiser
 from model.features import FrameScale
 from model.samples import Samples
+from pipelines.averages import MeanLayers
 from pipelines.cells import Cells, merged
 from pipelines.frame_context import frame_context, strips
+from pipelines.frame_reader import FrameReader
+from pipelines.mirrors import ALONE, STRAIGHT, Mirror
 from pipelines.tiles import Band, narrowed, within_reach
 
 FloatArray = npt.NDArray[np.float32]
@@ -93,7 +97,7 @@ def to_model(block: PathSamples, roles: tuple[str, ...], depth: float, device: t
 class BandInput:
     """What the network gets of a band: its samples, halo included, and of a context that bands share its part.
 
-    block : the samples as they were read
+    block : the samples as they were read, and mirrored; its `source` numbers those of the file's rows
     """
 
     band: Band
@@ -103,7 +107,7 @@ class BandInput:
 
 
 def read_bands(
-    reader: SampleReader,
+    reader: FrameReader,
     net: Denoiser,
     scale: FrameScale,
     roles: tuple[str, ...],
@@ -111,21 +115,26 @@ def read_bands(
     update: Callable[[float], None] = lambda _: None,
     held: frozenset[str] = frozenset(),
     cells: Cells | None = None,
+    mirror: Mirror = STRAIGHT,
 ) -> Iterator[BandInput]:
     """The input of band after band; their halos, and a context that several share, make cuts invisible.
 
     cells : rows without pixels to filter are left out of the bands, and what they alone see is not even read
+    mirror : the frame is mirrored; the bands are cut from what comes of that
     """
     window = reader.header.data_window
     device = next(net.parameters()).device
+    rows = reader.read if mirror == STRAIGHT else partial(reader.read_mirrored, mirror=mirror)
 
     def read(first: int, last: int) -> tuple[PathSamples, Samples]:
-        block, squares = reader.read(window.ymin + first, window.ymin + last), None
+        block, squares = rows(window.ymin + first, window.ymin + last), None
         if cells is not None:
-            block, squares = merged(block, cells.alike[first:last])
+            block, squares = merged(block, mirror.picture(cells.alike)[first:last])
         return block, to_model(block, roles, scale.depth, device, reader.carried_lights, held, squares)
 
-    busy = np.ones(window.height, np.bool_) if cells is None else np.logical_not(cells.mask.all(1))
+    busy = np.ones(window.height, np.bool_)
+    if cells is not None:
+        busy = np.logical_not(mirror.picture(cells.mask).all(1))
     halo, looks = net.reach, []
     if len(bands) > 1 and net.tile_reach is not None:
         halo, tallest = net.tile_reach, max(band.read1 - band.read0 for band in bands)
@@ -144,7 +153,7 @@ def read_bands(
 
 @torch.inference_mode()
 def denoise_bands(
-    reader: SampleReader,
+    reader: FrameReader,
     net: Denoiser,
     scale: FrameScale,
     roles: tuple[str, ...],
@@ -153,30 +162,31 @@ def denoise_bands(
     update: Callable[[float], None] = lambda _: None,
     held: frozenset[str] = frozenset(),
     cells: Cells | None = None,
+    mirrors: Sequence[Mirror] = ALONE,
 ) -> FrameLayers:
     """Denoises a frame band by band.
 
     cells : those that pass through are not filtered. None: everything is filtered
+    mirrors : the mirror images of the frame, itself among them, that are denoised and averaged
     """
     window = reader.header.data_window
     size = (window.height, window.width)
-    frame = Layers(
-        color=torch.empty(1, layers, 3, *size),
-        weight=torch.empty(1, layers, *size),
-        coverage=torch.empty(1, layers, *size),
-        depth=torch.empty(1, layers, *size),
-        extra=torch.empty(1, layers, reader.carried, *size),
-    )
+    mean = MeanLayers(size, layers, reader.carried)
     passing = np.zeros(size, np.bool_) if cells is None else cells.mask
-    for item in read_bands(reader, net, scale, roles, bands, update, held, cells):
-        band = item.band
-        rows = slice(band.y0 - band.read0, band.y1 - band.read0)
-        wanted = torch.zeros(1, band.read1 - band.read0, window.width, dtype=torch.bool)
-        wanted[0, rows] = torch.from_numpy(~passing[band.y0 : band.y1])
-        wanted = wanted.to(item.samples.weight.device)
-        result = net(item.samples, scale, layers, fill=False, wanted=wanted, decoded=item.decoded)
-        for whole, part in zip(_planes(frame), _planes(result), strict=True):
-            whole[..., band.y0 : band.y1, :] = part[..., rows, :].cpu()
+    for run, mirror in enumerate(mirrors):
+        filtered = np.logical_not(mirror.picture(passing))
+
+        def progress(done: float, run: int = run) -> None:
+            update((run + done) / len(mirrors))
+
+        for item in read_bands(reader, net, scale, roles, bands, progress, held, cells, mirror):
+            band = item.band
+            wanted = torch.zeros(1, band.read1 - band.read0, window.width, dtype=torch.bool)
+            wanted[0, band.y0 - band.read0 : band.y1 - band.read0] = torch.from_numpy(filtered[band.y0 : band.y1])
+            wanted = wanted.to(item.samples.weight.device)
+            mean.add(net(item.samples, scale, layers, fill=False, wanted=wanted, decoded=item.decoded), band, mirror)
+            del item  # or it would be there beside the next one
+    frame = mean.result()
     if cells is not None and cells.means is not None:
         _pass_through(frame, cells, cells.means, passing)
     return FrameLayers(*(plane[0].numpy() for plane in _planes(fill_holes(frame))))

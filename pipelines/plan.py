@@ -41,6 +41,7 @@ class FramePlan:
     mapping : which channels play them; shown without the unused ones that something else asks for
     held : those it is told to say nothing
     adapt : whether the cells that the survey found to have nothing to do pass through
+    model : which network, in words
     """
 
     source: Path
@@ -55,6 +56,7 @@ class FramePlan:
     kept: Sequence[str] = ()
     held: frozenset[str] = frozenset()
     adapt: bool = False
+    model: str = ""
 
     def lines(self) -> list[str]:
         """The plan, for `--dry-run`."""
@@ -65,6 +67,7 @@ class FramePlan:
             *replace(self.mapping, unused=tuple(name for name in self.mapping.unused if name not in asked)).lines(),
             f"weighting: {self.shot.weighting}",
             f"samples: {seen.samples} in {seen.pixels} pixels, {seen.empty_pixels} pixels without any",
+            *([f"model: {self.model}"] if self.model else []),
             f"roles in use: {', '.join(self.roles)}",
             *([f"roles held, which say nothing here: {', '.join(sorted(self.held))}"] if self.held else []),
             f"exposure: {self.shot.scale.exposure:.6g}, depth scale: {self.shot.scale.depth:.6g}",
@@ -108,9 +111,13 @@ class Room:
     """Whether the decoded frame stays in memory between survey and network: only where that costs no band."""
 
 
-def fit(reader: FrameReader, net: Denoiser, layers: int, memory: int) -> Room:
-    """Plans the bands of a frame from its header and the sizes of its rows; no sample is read."""
-    load = FrameLoad(reader.header.data_window.width, reader.samples_per_row, layers, reader.carried)
+def fit(reader: FrameReader, net: Denoiser, layers: int, memory: int, mirrored: bool = False, beside: int = 0) -> Room:
+    """Plans the bands of a frame from its header and the sizes of its rows; no sample is read.
+
+    mirrored : whether mirror images of it are denoised as well
+    beside : bytes that something else takes meanwhile
+    """
+    load = FrameLoad(reader.header.data_window.width, reader.samples_per_row, layers, reader.carried, mirrored)
 
     def planned(budget: int) -> tuple[list[Band], int]:
         bands = plan_bands(load, net.reach, net.tile_reach, net.stride, budget)
@@ -118,10 +125,11 @@ def fit(reader: FrameReader, net: Denoiser, layers: int, memory: int) -> Room:
         tallest = max(band.read1 - band.read0 for band in bands)
         return bands, load.needed_shared(tallest) if shared else load.needed(tallest)
 
-    bands, needed = planned(memory)
+    bands, needed = planned(memory - beside)
     if len(bands) == 1:  # its estimate holds a decoded frame already
-        return Room(bands, needed, keep=True)
-    tighter, beside = planned(memory - reader.kept_bytes)
-    if len(tighter) == len(bands) and beside + reader.kept_bytes <= memory:
-        return Room(tighter, beside + reader.kept_bytes, keep=True)
-    return Room(bands, needed, keep=False)
+        return Room(bands, needed + beside, keep=True)
+    kept = beside + reader.kept_bytes
+    tighter, more = planned(memory - kept)
+    if len(tighter) == len(bands) and more + kept <= memory:
+        return Room(tighter, more + kept, keep=True)
+    return Room(bands, needed + beside, keep=False)

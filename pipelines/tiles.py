@@ -17,6 +17,7 @@ import numpy.typing as npt
 # From peaks of `lbmc denoise` on frames of 960x540 and 1920x540 with 2 to 24 samples and 1 to 5 layers; a tenth more.
 BYTES_BASE = 350 << 20  # the process with its libraries
 BYTES_PER_SAMPLE = 105  # decoded roles in float32, and what the network holds per sample
+BYTES_PER_MIRRORED = 40  # besides, of each sample where mirror images are denoised as well
 BYTES_PER_PIXEL = 450  # context
 BYTES_PER_LAYER = 1100  # of each pixel: planes and predictions
 BYTES_PER_CARRIED = (16, 64)  # for each channel filtered besides the radiance: of each sample, of each pixel and layer
@@ -47,12 +48,14 @@ class FrameLoad:
 
     samples : (height,) how many each row holds
     carried : channels filtered besides the radiance
+    mirrored : whether mirror images of it are denoised as well
     """
 
     width: int
     samples: npt.NDArray[np.int64]
     layers: int
     carried: int = 0
+    mirrored: bool = False
 
     @property
     def height(self) -> int:
@@ -69,7 +72,8 @@ class FrameLoad:
         """Estimated peak bytes of denoising any so many rows at once."""
         per_sample, per_layer = BYTES_PER_CARRIED
         pixel = BYTES_PER_PIXEL + self.layers * (BYTES_PER_LAYER + self.carried * per_layer)
-        samples = self.most_samples(rows) * (BYTES_PER_SAMPLE + self.carried * per_sample)
+        per_sample = BYTES_PER_SAMPLE + self.carried * per_sample + self.mirrored * BYTES_PER_MIRRORED
+        samples = self.most_samples(rows) * per_sample
         result = self.height * self.width * self.layers * BYTES_OF_RESULT
         return BYTES_BASE + result + rows * self.width * pixel + samples
 

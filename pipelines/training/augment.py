@@ -8,14 +8,12 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from pipelines.mirrors import DIRECTIONS, Mirror
 from pipelines.training.cache import CHANNELS
 from pipelines.training.recipe import Augmentation
 
 FloatArray = npt.NDArray[np.float32]
 Scalar = TypeVar("Scalar", bound=np.generic)
-
-DIRECTIONS = {"normal": -1, "motion": 1, "lens": 1}
-"""Roles that point somewhere on the screen, and the sign of their y: normals have y up where the screen has y down."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +31,7 @@ class Turn:
 
     def picture(self, picture: npt.NDArray[Scalar]) -> npt.NDArray[Scalar]:
         """(H, W, ...) turned, a view."""
-        turned = picture.swapaxes(0, 1) if self.transpose else picture
-        turned = turned[:, ::-1] if self.mirror else turned
-        return turned[::-1] if self.flip else turned
+        return self._mirror.picture(picture.swapaxes(0, 1) if self.transpose else picture)
 
     def directions(self, samples: FloatArray) -> None:
         """Turns, in place, what points somewhere on the screen."""
@@ -43,10 +39,11 @@ class Turn:
             x = CHANNELS[role].start
             if self.transpose:
                 samples[:, [x, x + 1]] = np.float32(sign) * samples[:, [x + 1, x]]
-            if self.mirror:
-                samples[:, x] *= -1
-            if self.flip:
-                samples[:, x + 1] *= -1
+            self._mirror.directions(samples[:, x : x + 2])
+
+    @property
+    def _mirror(self) -> Mirror:
+        return Mirror(self.mirror, self.flip)
 
 
 def relight(rng: np.random.Generator, samples: FloatArray, target: FloatArray, how: Augmentation
