@@ -100,6 +100,12 @@ class SampleCache:
         return self._arrays[entry.name]
 
 
+def is_whole(folder: Path, entry: SceneEntry) -> bool:
+    """Whether all arrays of a scene are there: somebody may have made room on a disk."""
+    kinds = ("samples", "target", *("offsets",) * entry.ragged, *("weight",) * (entry.weighting == "over"))
+    return all(array_path(folder, entry.name, kind).is_file() for kind in kinds)
+
+
 def array_path(folder: Path, name: str, kind: str) -> Path:
     """Where the cache keeps one of a scene's arrays: samples, target, offsets or weight."""
     return folder / f"{name}.{kind}.npy"

@@ -31,6 +31,7 @@ from pipelines.training.cache import (
     SampleCache,
     SceneEntry,
     array_path,
+    is_whole,
     read_index,
 )
 from pipelines.training.recipe import SMALLEST_CROP
@@ -75,14 +76,14 @@ def scene_files(folder: Path, fewest: int = 1) -> list[SceneFiles]:
 
 def build_cache(source: Path, folder: Path, report: Report = lambda _: None, threads: int | None = None
                 ) -> SampleCache:
-    """Decodes into `folder` every scene of `source` that is not there yet or has changed. Returns the open cache.
+    """Decodes into `folder` every scene of `source` that is not there, whole, or has changed. Returns the open cache.
 
     Arrays are replaced whole, so that a training that has them mapped goes on undisturbed.
     Raises InputError, naming the file: see `scene_files` and `cache_scene`.
     """
     files = scene_files(source)
     folder.mkdir(parents=True, exist_ok=True)
-    known = read_index(folder)
+    known = {name: entry for name, entry in read_index(folder).items() if is_whole(folder, entry)}
     done: dict[str, SceneEntry] = {}
     missing = [item for item in files if item.name not in known or known[item.name].stamp != item.stamp()]
     for number, item in enumerate(missing, 1):

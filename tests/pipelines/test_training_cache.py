@@ -14,7 +14,7 @@ from deep_io.flat import write_flat
 from deep_io.header import Header
 from deep_io.path_samples import PathSamples, SampleReader
 from deep_io.samples import Window
-from pipelines.training.cache import CHANNEL_COUNT, CHANNELS, SampleCache, read_index
+from pipelines.training.cache import CHANNEL_COUNT, CHANNELS, SampleCache, array_path, read_index
 from pipelines.training.caching import build_cache, scene_files
 from tests.pipelines.training_data import COUNT, SIZE, uneven, write_example
 
@@ -109,6 +109,15 @@ def test_a_cached_scene_is_decoded_again_only_when_it_changed(scenes: Path, tmp_
     assert [entry.name for entry in after.entries] == ["scene0", "scene1", "scene2", "scene9"]
     assert not np.array_equal(after.arrays(after.entries[1]).samples, held)
     np.testing.assert_array_equal(mapped, held)  # a training that runs on the old arrays goes on undisturbed
+
+
+def test_a_scene_whose_arrays_were_removed_is_decoded_again(scenes: Path, tmp_path: Path) -> None:
+    told: list[str] = []
+    build_cache(scenes, tmp_path / "cache")
+    array_path(tmp_path / "cache", "scene1", "target").unlink()
+    cache = build_cache(scenes, tmp_path / "cache", told.append)
+    assert told == ["cached scene1 (1 of 1)"]
+    assert cache.arrays(cache.entries[1]).target.shape[2] == 3
 
 
 def test_what_another_run_cached_meanwhile_stays_in_the_index(scenes: Path, tmp_path: Path) -> None:
