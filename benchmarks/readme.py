@@ -8,7 +8,8 @@
         layers do, the pictures of layers (WORK is where benchmarks/paper.py left its networks)
 
 Ends with 1 where an error differs from the repository's by more than 1e-3 of itself. Times are another matter: what
-should agree is their ratio to OIDN's in the same run, and where it does not within a quarter, that is said.
+should agree is their ratio to OIDN's in the same run, and where it does not within a quarter, that is said. A run in
+which something failed also ends with 1; it says what, and is not kept.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "docs"))
 import figures
 
 from deep_io.errors import LbmcError
-from pipelines.bench.job import RESULTS, BenchOptions, bench
+from pipelines.bench.job import RESULTS, bench
+from pipelines.bench.options import BenchOptions
 from pipelines.bench.results import Results
 from pipelines.progress import ProgressKind
 
@@ -71,19 +73,32 @@ def ratios(results: Results) -> dict[str, float]:
     return {name: row.own_cpu / base for name, row in summary.items() if base and row.own_cpu and name not in idle}
 
 
-def refresh(scenes: list[str], work: Path | None, threads: int, progress: ProgressKind) -> None:
-    """What docs/results.md has from scenes that are not part of the repository."""
+def keep(found: Results, source: Path, target: Path) -> bool:
+    """Puts results in the repository, unless something failed in them: then that is said, and those there stay."""
+    missing = found.missing()
+    if missing:
+        print(f"ERROR: {source}: not kept as {target}, since something failed; mend it and run again:", file=sys.stderr)
+        print("\n".join(f"  {name}: {why}" for name, why in missing.items()), file=sys.stderr)
+        return False
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy(source, target)
+    return True
+
+
+def refresh(scenes: list[str], work: Path | None, threads: int, progress: ProgressKind) -> bool:
+    """What docs/results.md has from scenes that are not part of the repository. Whether all of it could be kept."""
+    kept = True
     for word in scenes:
         folder = Path(word.partition("=")[2])
         if not any(folder.glob(f"{MANY}.deep.exr")):
             continue
         with tempfile.TemporaryDirectory() as out:
-            bench(BenchOptions(folder, Path(out), match=MANY, threads=threads, repeats=1, frame=0, paper=False,
-                               savings=False, memory=False, growth=(), flip=False, progress=progress))
-            SAMPLES.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(Path(out) / RESULTS, SAMPLES)
+            found = bench(BenchOptions(folder, Path(out), match=MANY, threads=threads, repeats=1, frame=0, paper=False,
+                                       savings=False, memory=False, growth=(), flip=False, progress=progress))
+            kept &= keep(found, Path(out) / RESULTS, SAMPLES)
     _script("benchmarks/layers_alive.py", *scenes)
     _script("docs/layer_images.py", *(() if work is None else ("--work", work)))
+    return kept
 
 
 def _script(path: str, *words: object) -> None:
@@ -107,19 +122,18 @@ def main() -> int:
     print((options.out / "results.md").read_text("utf-8"))
     figures.save({"speed": figures.speed(found), "growth": figures.growth(found)}, options.out)
     print(f"{(time.monotonic() - begun) / 60:.1f} minutes; report: {options.out / 'report.html'}")
-    code = 0
+    code = int(bool(found.missing()))
     if kept is not None:
         errors, times = list(differing_errors(found, kept)), list(differing_times(found, kept))
         print("\n".join(errors) or f"every error agrees with results.json within {ERROR:g}")
         print("\n".join(times) or f"every time agrees with results.json within {TIME:.0%}, as a share of OIDN's")
-        code = int(bool(errors))
-    if options.keep:
-        shutil.copy(options.out / RESULTS, KEPT)
+        code |= int(bool(errors))
+    if options.keep and keep(found, options.out / RESULTS, KEPT):
+        code = 0
         if options.scenes:
-            refresh(options.scenes, options.work, options.threads, progress)
+            code = int(not refresh(options.scenes, options.work, options.threads, progress))
         _script("docs/figures.py")
         _script("docs/tables.py", "--write")
-        code = 0
     return code
 
 

@@ -18,7 +18,15 @@ from deep_io.atomic import atomic_output, output_action
 from deep_io.errors import InputError, UsageError
 from deep_io.sequences import Frame, expand, frame_path, has_range, is_sequence
 from model.metrics import Scores, geometric_mean, score
-from pipelines.flat_pictures import FlatPicture, PathLike, read_rgb
+from pipelines.flat_pictures import (
+    FlatPicture,
+    PathLike,
+    check_finite,
+    check_halves,
+    check_window,
+    mean_of_halves,
+    read_rgb,
+)
 from pipelines.jobs import JobReport, run_frames
 from pipelines.pictures import heat_map, panel
 from pipelines.progress import Progress, ProgressKind, make_progress
@@ -54,8 +62,7 @@ class Comparison:
         """The reference, or the mean of its two halves."""
         if self.other_half is None:
             return self.reference.rgb
-        mean: NDArray[np.floating[Any]] = (self.reference.rgb.astype(np.float64) + self.other_half.rgb) / 2.0
-        return mean
+        return mean_of_halves(self.reference, self.other_half)
 
     def heat_map(self) -> bytes:
         """PNG of the signed relative error with its scale."""
@@ -214,16 +221,11 @@ def compare(
     paths = (image, reference, *([other_half] if other_half is not None else []))
     pictures = [read_rgb(path, part, layer) for path in paths]
     for other in pictures[1:]:
-        if other.window != pictures[0].window:
-            raise InputError(f"{_placed(pictures[0])}, but {_placed(other)}; compare images of one window")
-    for picture in pictures:
-        bad = int(np.count_nonzero(~np.isfinite(picture.rgb).all(axis=-1)))
-        if bad:
-            raise InputError(f"{picture.path}: {bad} pixels are not finite, so no error can be measured")
+        check_window(pictures[0], other)
+    check_finite(pictures)
     half = pictures[2] if other_half is not None else None
-    if half and np.array_equal(half.rgb, pictures[1].rgb):
-        raise InputError(f"{pictures[1].path} and {half.path} are the same picture; two independent renderings are "
-                         "needed")
+    if half:
+        check_halves(pictures[1], half)
     try:
         scores = score(pictures[0].rgb, pictures[1].rgb, half.rgb if half else None, with_flip=with_flip)
     except ValueError as error:
@@ -292,8 +294,3 @@ def _cell(value: float | None) -> str:
 def _finite(values: dict[str, float | None]) -> dict[str, float | None]:
     """What is missing or not finite as None, since JSON knows no infinity."""
     return {name: value if value is not None and isfinite(value) else None for name, value in values.items()}
-
-
-def _placed(picture: FlatPicture) -> str:
-    window = picture.window
-    return f"{picture.path} is {window.width} x {window.height} at ({window.xmin}, {window.ymin})"

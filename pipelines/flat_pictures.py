@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,6 +56,38 @@ def read_rgb(path: PathLike, part: str | None = None, layer: str | None = None) 
         raise InputError(f"{name}: {_lack(channels, layer)}")
     rgb = np.stack([flat.channels[channel].astype(np.float32) for channel in colour], axis=-1)
     return FlatPicture(name, rgb, flat.window)
+
+
+def check_window(picture: FlatPicture, other: FlatPicture) -> None:
+    """Raises InputError, with both windows, where two pictures that are compared are not of one window."""
+    if other.window != picture.window:
+        raise InputError(f"{placed(picture.path, picture.window)}, but {placed(other.path, other.window)}; compare "
+                         "images of one window")
+
+
+def check_finite(pictures: Iterable[FlatPicture]) -> None:
+    """Raises InputError for the first picture with values that are not finite."""
+    for picture in pictures:
+        bad = int(np.count_nonzero(~np.isfinite(picture.rgb).all(axis=-1)))
+        if bad:
+            raise InputError(f"{picture.path}: {bad} pixels are not finite, so no error can be measured")
+
+
+def check_halves(one: FlatPicture, other: FlatPicture) -> None:
+    """Raises InputError where the two halves of a reference are one and the same picture."""
+    if np.array_equal(one.rgb, other.rgb):
+        raise InputError(f"{one.path} and {other.path} are the same picture; two independent renderings are needed")
+
+
+def mean_of_halves(one: FlatPicture, other: FlatPicture) -> NDArray[np.float64]:
+    """(H, W, 3) the reference that two independent renderings of one picture make together."""
+    mean: NDArray[np.float64] = (one.rgb.astype(np.float64) + other.rgb) / 2.0
+    return mean
+
+
+def placed(path: PathLike, window: Window) -> str:
+    """A file and where its pixels stand, for a reader."""
+    return f"{os.fspath(path)} is {window.width} x {window.height} at ({window.xmin}, {window.ymin})"
 
 
 def _colour(channels: Sequence[str], layer: str | None = None) -> tuple[str, ...]:

@@ -11,8 +11,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from deep_io.errors import UsageError
+from deep_io.errors import LbmcError
 from pipelines.bench.methods import MethodSpec, make
+from pipelines.jobs import MORE_MEMORY, describe_error
 
 STATUS = Path("/proc/self/status")
 """Where Linux says what a process holds; getrusage would count the memory of the process that started this one."""
@@ -24,13 +25,21 @@ def measurable() -> bool:
 
 
 def peak_memory(spec: MethodSpec, source: Path, threads: int, folder: Path) -> int:
-    """Bytes that making and running the method once take at most. Raises UsageError when the method fails."""
+    """Bytes that making and running the method once take at most. Raises LbmcError when the method fails."""
     task = {"spec": spec.to_dict(), "source": str(source.resolve()), "threads": threads, "folder": str(folder)}
     run = subprocess.run([sys.executable, "-m", "pipelines.bench.memory"], input=json.dumps(task), text=True,
                          capture_output=True, check=False)
     if run.returncode:
-        raise UsageError(f"{spec.name}: failed in a process of its own: {run.stderr.strip().splitlines()[-1:]}")
+        raise LbmcError(f"failed in a process of its own: {_why(run)}")
     return int(run.stdout.split()[-1])
+
+
+def _why(run: subprocess.CompletedProcess[str]) -> str:
+    """Why a process failed: what it said last, or how it ended."""
+    if run.returncode < 0:
+        return f"stopped by signal {-run.returncode}, as where the machine's memory runs out; {MORE_MEMORY}"
+    said = run.stderr.strip().splitlines()
+    return said[-1] if said else f"ended with exit code {run.returncode} and no word"
 
 
 def resident(field: str) -> int:
@@ -39,16 +48,21 @@ def resident(field: str) -> int:
     return int(found[1]) * 1024 if found else 0
 
 
-def main() -> None:
+def main() -> int:
     """The fresh process."""
     task = json.load(sys.stdin)
     folder = Path(task["folder"])
     before = resident("VmRSS")
-    method = make(MethodSpec(**task["spec"]), task["threads"], folder)
-    method.run(Path(task["source"]), folder / "memory.exr")
-    method.close()
+    try:
+        method = make(MethodSpec(**task["spec"]), task["threads"], folder)
+        method.run(Path(task["source"]), folder / "memory.exr")
+        method.close()
+    except Exception as error:  # told in one line by the process that waits for this one
+        print(describe_error(error), file=sys.stderr)
+        return 1
     print(max(resident("VmHWM") - before, 0))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

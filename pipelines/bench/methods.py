@@ -27,8 +27,10 @@ from model.atrous import atrous, bounded_depth
 from model.baseline import clamp_and_blur, pixel_means
 from model.config import LAYER, LAYER_W, OPTIMIZED, PIXEL_GATHER, SAMPLE_SPLAT, Config
 from model.denoiser import Denoiser
+from model.weight_files import DEFAULT_PRESET
 from pipelines.bench.clock import Clock
 from pipelines.denoise import Job
+from pipelines.frame_reader import FrameReader
 from pipelines.oidn import Oidn
 from pipelines.options import DenoiseOptions
 from pipelines.progress import Progress
@@ -217,10 +219,10 @@ class OidnMethod(FlatMethod):
 class LbmcMethod:
     """`lbmc denoise` itself, its job watched from outside."""
 
-    def __init__(self, model: str, threads: int, changes: Mapping[str, Any]) -> None:
+    def __init__(self, model: str, threads: int, changes: Mapping[str, Any], kind: type[Job] = Job) -> None:
         self.clock = Clock()
-        self.job = Job(DenoiseOptions("", "", model=model, device="cpu", threads=threads, existing="overwrite",
-                                      progress="none", **changes))
+        self.job = kind(DenoiseOptions("", "", model=model, device="cpu", threads=threads, existing="overwrite",
+                                       progress="none", **changes))
         self.clock.watch(self.job, "open", "read", self._watch_reader)
         self.clock.watch(self.job, "plan", "survey")
         self.clock.watch(self.job, "write", "write")
@@ -231,8 +233,8 @@ class LbmcMethod:
         """Of the weights."""
         return self.job.weights.name
 
-    def _watch_reader(self, reader: SampleReader) -> None:
-        for method in ("read", "blocks"):
+    def _watch_reader(self, reader: FrameReader) -> None:
+        for method in ("read", "read_mirrored", "blocks"):
             self.clock.watch(reader, method, "read")
 
     def run(self, source: Path, target: Path) -> None:
@@ -265,15 +267,12 @@ def watch_network(clock: Clock, net: Denoiser) -> None:
             clock.watch(module, method, stage)
 
 
-SAVINGS: Mapping[str, Mapping[str, Any]] = {
-    "nothing adapted": {"adapt": False},
-    "1 layer": {"layers": 1},
-    "bf16 products": {"precision": "bf16"},
-}
-"""What a network can be told to save, or not to save: changes of DenoiseOptions."""
+def shipped() -> tuple[str, ...]:
+    """The presets that ship, the default one first."""
+    return tuple(sorted(zoo.presets(), key=lambda name: name != DEFAULT_PRESET))
 
 
-def method_specs(models: tuple[str, ...], oidn: bool, paper: bool, savings: bool) -> list[MethodSpec]:
+def method_specs(models: tuple[str, ...], oidn: bool, paper: bool) -> list[MethodSpec]:
     """Every method of a bench, the input first. Raises InputError when two weight files share one name."""
     specs = [
         MethodSpec("noisy", "input", "mean"),
@@ -291,9 +290,6 @@ def method_specs(models: tuple[str, ...], oidn: bool, paper: bool, savings: bool
         if any(spec.name == name for spec in specs):
             raise InputError(f"--model {model}: another model is called {name!r} already; rename one of the files")
         specs.append(MethodSpec(name, "lbmc", "lbmc", model))
-        if savings:
-            specs += [MethodSpec(f"{name}, {label}", "saving", "lbmc", model, changes, name)
-                      for label, changes in SAVINGS.items()]
     if paper:
         specs += [MethodSpec(f"{name} (untrained)", "paper", "untrained", name) for name in PAPER]
     return specs

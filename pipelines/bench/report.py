@@ -5,10 +5,11 @@ from __future__ import annotations
 import base64
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files
+from itertools import groupby
 from string import Template
 from typing import Any
 
@@ -140,12 +141,13 @@ def _scenes(results: Results, samples: int) -> str:
 def _scatter(results: Results, samples: int, style: Mapping[str, Style]) -> str:
     summary = results.summary(samples)
     points = front_points(results, samples)
+    unscored = {spec.name for spec in results.methods if not spec.scored}
     marks = []
     for name, row in summary.items():
         if name in points:
             marks.append(Mark(name, style[name], row.own_cpu * FULL_HD, points[name][1],
                               f"{name}: {number(row.own_cpu * FULL_HD)} CPU s, relMSE {number(points[name][1])}"))
-        elif name in style and row.scores == {}:
+        elif name in style and row.cpu and name in unscored:
             marks.append(Mark(name.removesuffix(" (untrained)"), style[name], row.own_cpu * FULL_HD, None,
                               f"{name}: {number(row.own_cpu * FULL_HD)} CPU s; random weights, so no error"))
     return scatter(marks, pareto(points), "CPU seconds at 1920 x 1080", "relMSE")
@@ -164,7 +166,9 @@ def _curves(results: Results, samples: int, style: Mapping[str, Style]) -> list[
         relmse = row.scores["relmse"] if row.scores else None
         if row.scene in scenes and row.method in errors and relmse is not None:
             errors[row.method].setdefault(samples, []).append(relmse)
-    return [Line(name, style[name], [(float(count), geometric_mean(values)) for count, values in sorted(by.items())])
+    most = {count: max(len(by.get(count, ())) for by in errors.values()) for by in errors.values() for count in by}
+    return [Line(name, style[name], [(float(count), geometric_mean(values)) for count, values in sorted(by.items())
+                                     if len(values) == most[count]])  # of the same scenes as the other lines
             for name, by in errors.items()]
 
 
@@ -191,7 +195,8 @@ def _stages(results: Results) -> list[str]:
     samples = results.groups()[0]
     kinds = {spec.name: spec.family for spec in results.methods}
     summary = results.summary(samples)
-    rows = {name: {stage: seconds * FULL_HD for stage, seconds in row.cpu.items()} for name, row in summary.items()}
+    rows = {name: {stage: seconds * FULL_HD for stage, seconds in row.cpu.items()} for name, row in summary.items()
+            if row.cpu}
     ours = [(name, row) for name, row in rows.items() if kinds[name] not in ("paper", "input", "saving")]
     networks = [(name, row) for name, row in rows.items() if kinds[name] in ("paper", "lbmc")]
     charts = [_figure(f"Read, work, write, {_scenes(results, samples)}, scaled to 1920 x 1080",
@@ -209,12 +214,27 @@ def _figure(title: str, drawing: str) -> str:
 
 
 def _table(table: Table) -> str:
-    def row(cells: Any, tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+    head = _cells(table.head, "th", table.names)
+    if table.names == 1:
+        body = "<tbody>" + "".join(f"<tr>{_cells(row, 'td', 1)}</tr>" for row in table.rows) + "</tbody>"
+    else:  # what the rows of a group share stands once beside them
+        body = "".join(f"<tbody>{_group(list(rows), table.names - 1)}</tbody>"
+                       for _, rows in groupby(table.rows, lambda row: row[0]))
+    return (f'<section><h2>{escape(table.title)}</h2><div class="wide"><table><thead><tr>{head}</tr></thead>{body}'
+            f'</table></div><p class="note">{escape(table.note)}</p></section>')
 
-    body = "".join(row(cells, "td") for cells in table.rows)
-    return (f'<section><h2>{escape(table.title)}</h2><div class="wide"><table><thead>{row(table.head, "th")}</thead>'
-            f'<tbody>{body}</tbody></table></div><p class="note">{escape(table.note)}</p></section>')
+
+def _group(rows: Sequence[Sequence[str]], names: int) -> str:
+    """Rows with their first cell in common."""
+    shared = f'<th scope="rowgroup" class="word" rowspan="{len(rows)}">{escape(rows[0][0])}</th>'
+    lines = [_cells(row[1:], "td", names) for row in rows]
+    return "".join(f"<tr>{shared if index == 0 else ''}{line}</tr>" for index, line in enumerate(lines))
+
+
+def _cells(cells: Sequence[str], tag: str, names: int) -> str:
+    """The first `names` of them words, the others numbers."""
+    opening = [f'<{tag} class="word">'] * names + [f"<{tag}>"] * (len(cells) - names)
+    return "".join(f"{start}{escape(cell)}</{tag}>" for start, cell in zip(opening, cells, strict=True))
 
 
 def _images(results: Results, gallery: Gallery) -> dict[str, Any]:
@@ -226,6 +246,8 @@ def _images(results: Results, gallery: Gallery) -> dict[str, Any]:
         for method, data in images.items():
             scores = errors.get((scene, method))
             label = method if scores is None else f"{method}: relMSE {number(scores['relmse'] or 0.0)}"
+            if scores and (free := scores.get("relmse_unbiased")) is not None:
+                label += f", {number(free)} free of the reference's noise"
             source = "data:image/png;base64," + base64.b64encode(data).decode("ascii")
             listed.append({"method": method, "label": label, "src": source})
         scenes[scene] = {"width": width, "height": height, "images": listed}

@@ -3,37 +3,47 @@
 from __future__ import annotations
 
 import dataclasses
-import platform
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from deep_io.cores import usable_cores
 from model.metrics import bootstrap_interval, geometric_mean
-from pipelines import __version__
 from pipelines.bench.methods import OUTSIDE, MethodSpec
 
 FORMAT = 1
-MEANS = ("smape", "psnr", "ssim", "flip", "energy")
-"""Scores averaged over scenes as plain means; relMSEs as geometric ones."""
+MEANS = ("smape", "psnr", "ssim", "flip", "energy", "relmse_unbiased", "floor")
+"""Scores averaged over scenes as plain means; relMSEs that cannot be negative as geometric ones."""
 FEWEST_TO_RESAMPLE = 5
 """Scenes below which a bootstrap interval of 95 % is nearly or exactly their range."""
 LEAST_GAIN = 0.02
 """A method on the Pareto front has less error than every faster one by this share: less is not worth the wait."""
 
 
+What = Literal["error", "time", "samples", "saving", "memory"]
+WHAT: Mapping[What, str] = {
+    "error": "no error",
+    "time": "no time",
+    "samples": "no error with fewer samples",
+    "saving": "not among the savings",
+    "memory": "no memory",
+}
+"""What can be missing, for a reader."""
+
+
 @dataclass(frozen=True)
 class SceneInfo:
-    """A scene; `samples` per pixel."""
+    """A scene; `samples` per pixel.
+
+    floor : relMSE of the reference itself, by the noise of its two halves; None where it has no halves
+    """
 
     name: str
     width: int
     height: int
     samples: int
+    floor: float | None = None
 
     @property
     def megapixels(self) -> float:
@@ -77,6 +87,42 @@ class GrowthPoint:
     wall: float | None = None
 
 
+@dataclass(frozen=True)
+class SavingPoint:
+    """One saving on one scene, beside the full model: nothing adapted, its own number of layers, single precision.
+
+    model : name of the method whose weights these are
+    saving : a name of savings.py
+    chosen : whether the survey decides so on this scene; None where that is not the survey's to decide
+    before, after : CPU seconds of the model's own work without and with the saving, medians
+    relmse, smape : without and with the saving
+    """
+
+    model: str
+    saving: str
+    scene: str
+    chosen: bool | None
+    before: float
+    after: float
+    relmse: tuple[float, float]
+    smape: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Gap:
+    """What could not be measured of one method on one scene, and why."""
+
+    method: str
+    scene: str
+    what: What
+    why: str
+
+    @property
+    def cell(self) -> str:
+        """Which cell is empty, for a reader."""
+        return f"{self.method} on {self.scene}, {WHAT[self.what]}"
+
+
 @dataclass
 class Results:
     """Everything a bench found."""
@@ -89,12 +135,20 @@ class Results:
     curve: list[CurvePoint] = field(default_factory=list)
     growth: list[GrowthPoint] = field(default_factory=list)
     memory: dict[str, int] = field(default_factory=dict)
+    savings: list[SavingPoint] = field(default_factory=list)
     failed: dict[str, str] = field(default_factory=dict)
     """Scene that was left out, since it cannot be read -> why."""
+    gaps: list[Gap] = field(default_factory=list)
+
+    def missing(self) -> dict[str, str]:
+        """Scenes that were left out, and what else could not be measured -> why. Empty where all went well."""
+        return {**self.failed, **{gap.cell: gap.why for gap in self.gaps}}
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {"format": FORMAT, **dataclasses.asdict(self)}
+        """For JSON. "unbiased", the means free of the reference's noise by samples per pixel, follows from the rest."""
+        unbiased = {str(samples): dataclasses.asdict(found) for samples in self.groups()
+                    if (found := self.unbiased(samples)) is not None}
+        return {"format": FORMAT, **dataclasses.asdict(self), "unbiased": unbiased}
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> Results:
@@ -105,7 +159,10 @@ class Results:
             data["machine"], data["protocol"], [MethodSpec(**row) for row in data["methods"]],
             [SceneInfo(**row) for row in data["scenes"]], [Measurement(**row) for row in data["measurements"]],
             [CurvePoint(**row) for row in data["curve"]], [GrowthPoint(**row) for row in data["growth"]],
-            dict(data["memory"]), dict(data.get("failed", {})),
+            dict(data["memory"]),
+            [SavingPoint(**{**row, "relmse": tuple(row["relmse"]), "smape": tuple(row["smape"])})
+             for row in data.get("savings", [])],
+            dict(data.get("failed", {})), [Gap(**row) for row in data.get("gaps", [])],
         )
 
     def groups(self) -> list[int]:
@@ -118,14 +175,51 @@ class Results:
         return [scene for scene in self.scenes if scene.samples == samples]
 
     def summary(self, samples: int) -> dict[str, Summary]:
-        """The means of each method that was measured over the scenes of a group."""
+        """The means of each method that was measured over the scenes of a group.
+
+        A method that lacks an error, or a time, on one of the scenes has no mean of it: that of the others would be
+        of other scenes than its neighbours in the table.
+        """
         scenes = {scene.name for scene in self.scenes_of(samples)}
+        lacks = {(gap.method, gap.what) for gap in self.gaps if gap.scene in scenes}
         found: dict[str, Summary] = {}
         for spec in self.methods:
             rows = [row for row in self.measurements if row.method == spec.name and row.scene in scenes]
             if rows:
-                found[spec.name] = summarize(rows)
+                whole = summarize(rows)
+                if (spec.name, "error") in lacks:
+                    whole = dataclasses.replace(whole, scores={}, interval=None)
+                if (spec.name, "time") in lacks:
+                    whole = dataclasses.replace(whole, cpu={}, wall={})
+                found[spec.name] = whole
         return found
+
+    def unbiased(self, samples: int) -> Unbiased | None:
+        """Of those scenes of a group whose reference has two halves; None where none has."""
+        floors = {scene.name: scene.floor for scene in self.scenes_of(samples) if scene.floor is not None}
+        if not floors:
+            return None
+        methods: dict[str, tuple[float, float]] = {}
+        for spec in self.methods:
+            rows = [row.scores for row in self.measurements
+                    if row.method == spec.name and row.scene in floors and row.scores]
+            if len(rows) == len(floors):
+                plain, free = (float(np.mean([row[key] for row in rows])) for key in ("relmse", "relmse_unbiased"))
+                methods[spec.name] = plain, free
+        return Unbiased(list(floors), float(np.mean(list(floors.values()))), methods)
+
+
+@dataclass(frozen=True)
+class Unbiased:
+    """Errors free of the reference's own noise: arithmetic means over scenes, since such an error may be negative.
+
+    floor : relMSE of the references themselves
+    methods : name -> relMSE, plain and free of the reference's noise; of methods that have it on all of the scenes
+    """
+
+    scenes: list[str]
+    floor: float
+    methods: dict[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -198,32 +292,3 @@ def pareto(points: Mapping[str, tuple[float, float]]) -> list[str]:
             front.append(name)
         best = min(best, error)
     return front
-
-
-def machine(threads: int) -> dict[str, Any]:
-    """The processor, the system, the versions and the threads of this run."""
-    packages = {}
-    for name in ("torch", "numpy", "OpenEXR", "pyoidn", "flip-evaluator"):
-        try:
-            packages[name] = version(name)
-        except PackageNotFoundError:
-            packages[name] = "not installed"
-    return {
-        "processor": processor(),
-        "cores": usable_cores(),
-        "threads": threads,
-        "system": platform.platform(),
-        "python": platform.python_version(),
-        "lbmc": __version__,
-        **packages,
-    }
-
-
-def processor() -> str:
-    """The processor's name as the system tells it."""
-    path = Path("/proc/cpuinfo")
-    if path.is_file():
-        for line in path.read_text("utf-8", "replace").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,19 @@ from numpy.typing import NDArray
 from deep_io import DeepSamples, Window, read_deep, write_deep
 from deep_io.errors import InputError
 from deep_io.path_samples import SampleReader
-from model.metrics import common_scale
-from pipelines.flat_pictures import FlatPicture, read_rgb
-from pipelines.scene_names import DEEP, REFERENCE, reference_of, scene_name
+from model.metrics import Scores, common_scale, reference_floor, relmse, score, smape
+from pipelines.flat_pictures import (
+    FlatPicture,
+    check_finite,
+    check_halves,
+    check_window,
+    mean_of_halves,
+    placed,
+    read_rgb,
+)
+from pipelines.scene_names import DEEP, REFERENCE, other_half_of, reference_of, scene_name
+
+Image = NDArray[np.floating[Any]]
 
 SEED = 20100623
 """Of the order in which samples are left out, the same in every run."""
@@ -25,7 +36,10 @@ SEED = 20100623
 class Scene:
     """One deep sample file and its reference.
 
+    reference : the mean of both halves, where there are two
     samples : per pixel, on average, rounded
+    halves : two independent renderings (H, W, 3) whose mean the reference is; None where there is only one
+    floor : relMSE of the reference itself, by its halves
     """
 
     name: str
@@ -33,6 +47,8 @@ class Scene:
     reference: FlatPicture
     samples: int
     weighting: str
+    halves: tuple[Image, Image] | None = None
+    floor: float | None = None
 
     @property
     def width(self) -> int:
@@ -45,6 +61,17 @@ class Scene:
     @property
     def megapixels(self) -> float:
         return self.width * self.height / 1e6
+
+    def score(self, picture: Image, *, with_flip: bool = True) -> Scores:
+        """All metrics of a picture (H, W, 3) of this scene."""
+        one, other = self.halves or (self.reference.rgb, None)
+        return score(picture, one, other, with_flip=with_flip)
+
+    def errors(self, picture: Image) -> tuple[float, float]:
+        """relMSE and SMAPE alone, which take a fraction of the time."""
+        k = common_scale(self.reference.rgb)
+        scaled, reference = k * picture.astype(np.float64), k * self.reference.rgb.astype(np.float64)
+        return relmse(scaled, reference), smape(scaled, reference)
 
     def thinned_counts(self) -> list[int]:
         """1, 2, 4, ... below the file's own samples per pixel; none where samples are not simply averaged."""
@@ -97,27 +124,34 @@ def open_scenes(pairs: Iterable[tuple[Path, Path]]) -> tuple[list[Scene], dict[s
 
 
 def open_scene(source: Path, reference: Path) -> Scene:
-    """One pair, checked. Raises InputError for files that cannot be read, windows that differ (both are named), a
-    reference without light or with values that are not finite.
+    """One pair, checked, with the other half of the reference where NAME.ref2.exr is there.
+
+    Raises InputError for files that cannot be read, windows that differ (both are named), halves that are one and the
+    same picture, a reference without light or with values that are not finite.
     """
-    picture = read_rgb(reference)
+    picture, other = read_rgb(reference), other_half_of(source)
+    pictures = [picture, read_rgb(other)] if other.exists() else [picture]
     with SampleReader(source) as reader:
         window = reader.header.data_window
         if window != picture.window:
-            raise InputError(
-                f"{source} is {window.width} x {window.height} at ({window.xmin}, {window.ymin}), but {reference} is "
-                f"{picture.window.width} x {picture.window.height} at ({picture.window.xmin}, {picture.window.ymin})"
-            )
+            raise InputError(f"{placed(source, window)}, but {placed(reference, picture.window)}; a scene is a pair of "
+                             "one window")
         samples = max(round(reader.total / (window.width * window.height)), 1)
         weighting = reader.weighting
-    bad = int(np.count_nonzero(~np.isfinite(picture.rgb).all(axis=-1)))
-    if bad:
-        raise InputError(f"{reference}: {bad} pixels are not finite, so no error can be measured")
+    for half in pictures[1:]:
+        check_window(picture, half)
+    check_finite(pictures)
+    halves = None
+    if len(pictures) == 2:
+        check_halves(*pictures)
+        halves = pictures[0].rgb, pictures[1].rgb
+        picture = replace(picture, rgb=mean_of_halves(*pictures))
     try:
-        common_scale(picture.rgb)
+        k = common_scale(picture.rgb)
     except ValueError as error:
         raise InputError(f"{reference}: {error}") from error
-    return Scene(scene_name(source), source, picture, samples, weighting)
+    floor = None if halves is None else reference_floor(*(k * half.astype(np.float64) for half in halves))
+    return Scene(scene_name(source), source, picture, samples, weighting, halves, floor)
 
 
 def thin(samples: DeepSamples, most: int, seed: int = SEED) -> DeepSamples:

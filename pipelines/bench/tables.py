@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import isnan, nan
 from typing import Any
 
+from model.metrics import geometric_mean
 from pipelines.bench.charts import number
 from pipelines.bench.methods import FAMILIES, OUTSIDE, STAGES
-from pipelines.bench.results import LEAST_GAIN, Results, Summary, pareto, spread_name
+from pipelines.bench.results import LEAST_GAIN, Results, SavingPoint, Summary, pareto, spread_name
+from pipelines.bench.savings import ANYWHERE, BY_NAME, CONTEXT
 
 SMALL_FRAME = 0.2
 """Megapixels of a timed frame below which the page warns of costs that do not grow with it."""
@@ -32,16 +35,21 @@ PUBLISHED = {
 
 @dataclass(frozen=True)
 class Table:
-    """A table with a title; the first column is a name, the others are numbers."""
+    """A table with a title; the first columns, as many as `names`, are words, the others are numbers.
+
+    With several of words, rows that share the first one follow each other: a group.
+    """
 
     title: str
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
     note: str = ""
+    names: int = 1
 
     def markdown(self) -> str:
         """A Markdown section."""
-        lines = ["| " + " | ".join(self.head) + " |", "|---" + "|---:" * (len(self.head) - 1) + "|"]
+        rule = "|---" * self.names + "|---:" * (len(self.head) - self.names) + "|"
+        lines = ["| " + " | ".join(self.head) + " |", rule]
         lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in self.rows]
         note = f"\n\n{self.note}" if self.note else ""
         return f"## {self.title}\n\n" + "\n".join(lines) + note + "\n"
@@ -49,11 +57,12 @@ class Table:
 
 def all_tables(results: Results) -> list[Table]:
     """Every table that the results fill, in the order of the page."""
-    tables = [methods_table(results, samples) for samples in results.groups()]
+    tables = []
+    for samples in results.groups():
+        tables += [methods_table(results, samples), unbiased_table(results, samples)]
     tables.append(stages_table(results, results.groups()[0]))
-    tables += [table for table in (savings_table(results), growth_table(results), published_table(results))
-               if table.rows]
-    return tables
+    tables += [savings_table(results), growth_table(results), published_table(results)]
+    return [table for table in tables if table.rows]
 
 
 def methods_table(results: Results, samples: int) -> Table:
@@ -65,7 +74,8 @@ def methods_table(results: Results, samples: int) -> Table:
         if spec.name not in summary or spec.family == "saving":
             continue
         row = summary[spec.name]
-        time = ["–", "–"] if spec.family == "input" else [number(row.own_cpu * FULL_HD), number(row.own_wall * FULL_HD)]
+        idle = spec.family == "input" or not row.cpu
+        time = ["–", "–"] if idle else [number(row.own_cpu * FULL_HD), number(row.own_wall * FULL_HD)]
         memory = results.memory.get(spec.name)
         rows.append([spec.name + (" ★" if spec.name in front else ""), *_errors(row), *time,
                      "–" if memory is None else f"{memory / 2**20:.0f}"])
@@ -81,14 +91,40 @@ def methods_table(results: Results, samples: int) -> Table:
     return Table(f"{count} scene{'s' if count != 1 else ''} with {samples} samples per pixel", head, rows, note)
 
 
+def unbiased_table(results: Results, samples: int) -> Table:
+    """relMSE on every scene whose reference has two halves: plain, and free of the reference's noise."""
+    found = results.unbiased(samples)
+    names = [spec.name for spec in results.methods if spec.scored and spec.family != "saving"]
+    scores = {(row.scene, row.method): row.scores for row in results.measurements if row.scores}
+    floors = {scene.name: scene.floor for scene in results.scenes_of(samples) if scene.floor is not None}
+    rows = []
+    for scene, floor in floors.items():
+        cells = [scores.get((scene, name)) for name in names]
+        pairs = [None if cell is None else (cell["relmse"], cell["relmse_unbiased"]) for cell in cells]
+        rows.append([scene, f"{floor:.4f}", *map(_pair, pairs)])
+    if found and len(floors) > 1:
+        rows.append(["mean", f"{found.floor:.4f}", *(_pair(found.methods.get(name)) for name in names)])
+    note = ("relMSE against the mean of both halves of the reference / free of the noise of that mean, as two "
+            "independent halves give it (it may be slightly negative). Means are arithmetic for both. The floor is "
+            "what the reference's own noise adds: below it, plain relMSE tells no image from a perfect one.")
+    return Table(f"relMSE free of the reference's noise, {samples} samples per pixel", ("scene", "floor", *names), rows,
+                 note)
+
+
+def _pair(errors: tuple[float | None, float | None] | None) -> str:
+    """relMSE, plain and unbiased."""
+    return "–" if errors is None or None in errors else f"{errors[0]:.4f} / {errors[1]:.4f}"
+
+
 def front_points(results: Results, samples: int) -> dict[str, tuple[float, float]]:
     """(CPU seconds per megapixel, relMSE) of the methods that compete: those with an error that do something."""
     summary = results.summary(samples)
     points = {}
     for spec in results.methods:
-        error = summary[spec.name].scores.get("relmse") if spec.name in summary else None
-        if error is not None and spec.family not in ("input", "saving"):
-            points[spec.name] = (summary[spec.name].own_cpu, error)
+        row = summary.get(spec.name)
+        error = row.scores.get("relmse") if row else None
+        if row and row.cpu and error is not None and spec.family not in ("input", "saving"):
+            points[spec.name] = (row.own_cpu, error)
     return points
 
 
@@ -99,7 +135,7 @@ def stages_table(results: Results, samples: int) -> Table:
     rows = [
         [name, *(number(1e3 * row.cpu[stage]) if stage in row.cpu else "–" for stage in stages),
          number(1e3 * sum(row.cpu.values()))]
-        for name, row in summary.items()
+        for name, row in summary.items() if row.cpu
     ]
     note = ("CPU milliseconds per megapixel, medians. Methods that are no network have their whole work under "
             f"{STAGES['filter']!r}. Flattening stands for what a renderer would have handed over, so it counts for no "
@@ -110,22 +146,41 @@ def stages_table(results: Results, samples: int) -> Table:
 
 
 def savings_table(results: Results) -> Table:
-    """Each other configuration of lbmc against lbmc as it ships: time saved, error added."""
+    """Time saved beside error added, saving by saving: where the survey chooses it, and where it is forced."""
+    models = dict.fromkeys(point.model for point in results.savings if point.saving != CONTEXT.name)
     rows = []
-    for samples in results.groups():
-        summary = results.summary(samples)
-        for spec in results.methods:
-            if spec.family != "saving" or spec.name not in summary or spec.base not in summary:
-                continue
-            row, base = summary[spec.name], summary[spec.base]
-            rows.append([spec.name, str(samples), _change(row.own_cpu, base.own_cpu),
-                         _change(row.scores["relmse"], base.scores["relmse"]),
-                         _change(row.scores["smape"], base.scores["smape"])])
-    head = ("lbmc as it ships, but", "samples", "CPU time", "relMSE", "SMAPE")
-    return Table("What savings save and cost", head, rows,
-                 "Changes against the same weights as they ship, over all scenes, whether or not the survey chooses so "
-                 "on them; a plus is slower or worse. In lbmc's repository, docs/adapting.md tells chosen from forced "
-                 "and has the other savings; benchmarks/bench_adapting.py measures them.")
+    for name in dict.fromkeys(point.saving for point in results.savings):
+        for model in dict.fromkeys(point.model for point in results.savings if point.saving == name):
+            label = name if [model] == [*models] else f"{name}: {model}"
+            points = [point for point in results.savings if (point.saving, point.model) == (name, model)]
+            saving = BY_NAME[name]
+            kinds = {saving.there: True, saving.others: False} if saving.of_scenes else {ANYWHERE: None}
+            rows += [[label, words, *_saved([point for point in points if point.chosen is chosen])]
+                     for words, chosen in kinds.items()]
+    head = ("saving", "scenes", "number", "time saved", "relMSE added", "worst scene", "SMAPE added")
+    note = (f"Each saving by itself beside the full model ({', '.join(models) or 'a network'} with nothing adapted), "
+            "on every scene as it is: CPU time of the model's own work, medians of "
+            f"{results.protocol.get('repeats')} runs that take turns, and ratios of errors, geometric means. Below 0 % "
+            "is slower, or better. The survey chooses a saving where the scene does not need what it leaves out. On "
+            "the others it was forced, to show what it would cost; cells are never forced. Saving nothing at all shows "
+            "the noise of the clock: less than that is no time saved. A role that is held is told to say nothing, as "
+            "the survey does it; one that is dropped is unknown to the network. ")
+    if CONTEXT.name not in {point.saving for point in results.savings}:
+        note += ("The context at half resolution is part of a network, so that no single one can tell what it saves: "
+                 "--contexts FULL HALF adds it, from two that differ in that alone.")
+    return Table("What a scene does not need: time saved, error added", head, rows, note.strip(), names=2)
+
+
+def _saved(points: Sequence[SavingPoint]) -> list[str]:
+    """Number of scenes, time saved, and errors added: relMSE on average and at worst, SMAPE on average."""
+    if not points:
+        return ["0", *["–"] * 4]
+    time = 1.0 - sum(point.after for point in points) / sum(point.before for point in points)
+    relmse, smape = ([after / before for before, after in pairs if before > 0.0] for pairs in (
+        [point.relmse for point in points], [point.smape for point in points]))
+    added = (geometric_mean(relmse), max(relmse, default=nan), geometric_mean(smape))
+    return [str(len(points)), f"{100.0 * time:.1f} %",
+            *("–" if isnan(ratio) else f"{100.0 * (ratio - 1.0):+.1f} %" for ratio in added)]
 
 
 def growth_table(results: Results) -> Table:
@@ -170,12 +225,22 @@ def protocol_lines(results: Results) -> list[str]:
     if max(row.megapixels for row in results.measurements) < SMALL_FRAME:
         lines.append("The frames are small, so that what a run costs at any size (opening files, starting a filter) "
                      "weighs more than in a film frame; compare methods, do not predict frames.")
+    if protocol.get("averaged"):
+        lines.append(f"{', '.join(protocol['averaged'])}: the mean of several runs of a network on the frame and its "
+                     "mirror images; what savings save and what samples cost is measured on one run.")
     if results.curve:
         lines.append("For fewer samples, each pixel draws its own at random; 2 hold the 1, 4 the 2, and so on.")
     if protocol.get("without_reference"):
         lines.append(unpaired_line(protocol["without_reference"]))
+    halves = [scene.name for scene in results.scenes if scene.floor is not None]
+    if halves:
+        lines.append(f"Of {len(halves)} of {len(results.scenes)} scenes the reference is the mean of two independent "
+                     "halves, NAME.ref.exr and NAME.ref2.exr.")
     if results.failed:
         lines.append(f"Left out, since they cannot be read: {'; '.join(results.failed.values())}.")
+    if results.gaps:
+        lines.append("Not measured, – in the tables, where means are of methods measured on every scene: "
+                     + "; ".join(f"{gap.cell}: {gap.why}" for gap in results.gaps) + ".")
     if not protocol["oidn"]:
         lines.append(INSTALL_OIDN)
     if not any(spec.family == "lbmc" for spec in results.methods):
@@ -218,9 +283,3 @@ def _errors(row: Summary) -> list[str]:
     digits = {"relmse": 4, "relmse_trimmed": 4, "smape": 4, "psnr": 2, "ssim": 4, "flip": 4, "energy": 3}
     cells = {name: "–" if scores.get(name) is None else f"{scores[name]:.{places}f}" for name, places in digits.items()}
     return [cells.pop("relmse"), interval, *cells.values()]
-
-
-def _change(value: float | None, base: float | None) -> str:
-    if value is None or not base:
-        return "–"
-    return f"{100.0 * (value / base - 1.0):+.1f} %"

@@ -16,7 +16,8 @@ import pytest
 
 from deep_io import Window
 from model.metrics import score
-from pipelines.bench.methods import SAVINGS, oidn_installed
+from model.weight_files import MIRRORED, presets
+from pipelines.bench.methods import oidn_installed
 from pipelines.bench.results import Results
 from pipelines.flat_pictures import read_rgb
 from tests.end_to_end.bench_scenes import write_pair, write_reference
@@ -66,7 +67,7 @@ def results(report: Path) -> dict[str, Any]:
 
 def test_every_method_is_measured_on_every_scene(results: dict[str, Any]) -> None:
     names = {method["name"] for method in results["methods"]}
-    wanted = {"noisy", "clamp and blur", "à-trous wavelets", "lbmc tiny", *(f"lbmc tiny, {key}" for key in SAVINGS)}
+    wanted = {"noisy", "clamp and blur", "à-trous wavelets", "lbmc tiny"}
     if oidn_installed():
         wanted |= {"OIDN colour", "OIDN + albedo, normal", "OIDN prefiltered"}
     assert names == wanted
@@ -166,7 +167,7 @@ def test_an_unscored_network_has_a_time_and_no_error(
     folder: Path, tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The paper's networks, on a frame of their own, which is smaller even than the scene."""
-    monkeypatch.setattr("pipelines.bench.job.UNTRAINED_FRAME", 16)
+    monkeypatch.setattr("pipelines.bench.protocol.UNTRAINED_FRAME", 16)
     words = [40 if word == 0 else word for word in QUICK if word != "--no-paper"]
     run = in_process("bench", folder, "--match", "first", "--out", tmp_path, "--model", weights, *words)
     assert run.code == 0, run.err
@@ -182,6 +183,28 @@ def test_an_unscored_network_has_a_time_and_no_error(
     assert re.search(r"\| LAYER \(untrained\) \| – \|", run.out)
 
 
+def test_every_preset_that_ships_is_a_method_unless_models_are_named(folder: Path, tmp_path: Path) -> None:
+    words = [word for word in QUICK if word != "--no-savings"]
+    run = in_process("bench", folder, "--match", "first", "--out", tmp_path, *words)
+    assert run.code == 0, run.err
+    found = json.loads((tmp_path / "results.json").read_text("utf-8"))
+    ours = [method["name"] for method in found["methods"] if method["family"] == "lbmc"]
+    assert ours[0] == "lbmc fast"
+    assert sorted(ours) == [f"lbmc {name}" for name in presets()]
+    scores = {row["method"]: row["scores"] for row in found["measurements"]}
+    for name in presets():
+        out = tmp_path / f"{name}.exr"
+        assert in_process("denoise", folder / "first.deep.exr", out, "--model", name, "--threads", 1, "--device",
+                          "cpu").code == 0
+        expected = score(read_rgb(out).rgb, read_rgb(folder / "first.ref.exr").rgb, with_flip=False)
+        assert scores[f"lbmc {name}"]["relmse"] == pytest.approx(expected.relmse, rel=1e-6), name
+    averaged = [f"lbmc {name}" for name in MIRRORED]
+    assert found["protocol"]["averaged"] == averaged
+    assert {point["model"] for point in found["savings"]} == {*ours} - {*averaged}  # those of one run
+    assert f"{', '.join(averaged)}: the mean of several runs" in run.out
+    assert all(f"| {name}" in run.out for name in ours)
+
+
 def test_results_that_exist_are_kept(report: Path, folder: Path) -> None:
     before = (report / "results.json").read_bytes()
     run = in_process("bench", folder, "--out", report, *QUICK)
@@ -194,7 +217,7 @@ def test_results_that_exist_are_kept(report: Path, folder: Path) -> None:
 def test_without_oidn_the_report_says_how_to_get_it(
     folder: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipelines.bench.job.oidn_installed", lambda: False)
+    monkeypatch.setattr("pipelines.bench.protocol.oidn_installed", lambda: False)
     run = in_process("bench", folder, "--match", "first", "--out", tmp_path, "--model", weights, *QUICK)
     assert run.code == 0, run.err
     assert "| OIDN" not in run.out
@@ -246,7 +269,7 @@ def test_scenes_that_cannot_be_read_are_left_out_and_the_others_measured(
     first, third = ([line for line in lines if line.startswith(f"ERROR: {scenes / name}.deep.exr: row 23: ")]
                     for name in ("first", "third"))
     assert len(first) == len(third) == 1
-    told = [lines.index(line) for line in (*third, *first, "Progress: 100%", "failed scenes:")]
+    told = [lines.index(line) for line in (*third, *first, "Progress: 100%", "failed:")]
     assert told == sorted(told)
     assert lines[-2:] == [line.replace("ERROR:", f"  {name}:") for line, name in ((third[0], "third"),
                                                                                  (first[0], "first"))]

@@ -1,4 +1,4 @@
-"""The scripts that measure and draw: benchmarks/paper.py, layers_alive.py and readme.py, docs/figures.py."""
+"""The scripts that measure and draw: paper.py and its like in benchmarks, layers_alive.py, readme.py; figures.py."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ import sys
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from deep_io import Window
+from deep_io.errors import InputError
 from deep_io.path_samples import SampleReader
 from pipelines.bench.methods import MethodSpec
 from pipelines.bench.results import CurvePoint, GrowthPoint, Measurement, Results, SceneInfo
@@ -85,6 +87,68 @@ def test_networks_of_a_group_are_trained_alike(script: ModuleType) -> None:
     assert counts == [1, 3, 4, 5]
     pairs = {one.recipe.seed for one in runs if one.name == "fast"}
     assert pairs == {one.recipe.seed for one in runs if one.name == "pixel aggregate"} == {1, 2, 3}
+
+
+def test_every_network_of_the_paper_and_ours_is_timed_beside_oidn(script: ModuleType, tmp_path: Path) -> None:
+    rows = tmp_path / "rows.json"
+    rows.write_text(json.dumps({"scenes": ["one"], "rows": {"kept": {"steps": 3}}}), "utf-8")
+    run("benchmarks/paper_times.py", "--frame", 32, "--repeats", 1, "--json", rows)
+    found = json.loads(rows.read_text("utf-8"))
+    assert found["rows"] == {"kept": {"steps": 3}}
+    seconds = found["times"]["cpu_seconds_a_megapixel"]
+    assert set(seconds) == {one.name for one in import_module("reduced").runs()} | {"clamp and blur",
+                                                                                   found["times"]["yardstick"]}
+    assert all(value > 0 for value in seconds.values())
+    assert seconds["LAYER, tone-mapped L2"] == seconds["LAYER"]  # one network, trained in two ways
+    assert found["times"]["machine"]["threads"] == 1
+
+
+def reduced_row(name: str, steps: int, relmse: float, group: str = "paper") -> dict[str, Any]:
+    """A row as benchmarks/paper.py makes it, of one scene a set."""
+    errors = {"relmse": relmse, "trimmed": relmse, "smape": relmse}
+    return {"name": name, "group": group, "seed": 1, "steps": steps, "batch": 2, "crop": 64, "layers": 2,
+            "cpu_seconds_a_step": 0.1, "scenes": {"val2": {"s": errors}, "shared": {"t": errors}}}
+
+
+def test_rows_are_kept_group_by_group_and_only_of_equal_steps(script: ModuleType, tmp_path: Path) -> None:
+    kept = {"A.1": reduced_row("A", 250, 0.2), "B.1": reduced_row("B", 250, 0.3),
+            "C.1": reduced_row("C", 9, 0.1, "ours")}
+    found = {"A.1": reduced_row("A", 3000, 0.1), "B.1": reduced_row("B", 3000, 0.2),
+             "C.1": reduced_row("C", 3000, 0.1, "ours")}
+    mine, theirs = tmp_path / "mine.json", tmp_path / "theirs.json"
+    mine.write_text(json.dumps({"scenes": ["one"], "rows": kept, "times": {"frame": 8}}), "utf-8")
+    theirs.write_text(json.dumps({"scenes": ["one"], "rows": found}), "utf-8")
+    run("benchmarks/keep_paper.py", theirs, "--json", mine)
+    document = json.loads(mine.read_text("utf-8"))
+    assert document["rows"] == {"A.1": found["A.1"], "B.1": found["B.1"], "C.1": kept["C.1"]}
+    assert document["times"] == {"frame": 8}
+    keep = import_module("keep_paper")
+    for rows, words in (({"A.1": found["A.1"]}, r"has no B\.1"),
+                        ({**found, "B.1": kept["B.1"]}, r"rows of \[250, 3000\] steps")):
+        with pytest.raises(InputError, match=words):
+            keep.replaced(kept, rows, "paper")
+
+
+def test_sentences_about_the_papers_networks_are_counted_from_the_rows(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tables = import_module("paper_tables")
+    names = {"LAYER": 0.10, "PIXELGATHER": 0.12, "OPTIMIZED": 0.08, "LAYER, tone-mapped L2": 0.11}
+    rows = {name: reduced_row(name, 3000, error) for name, error in names.items()}
+    document = {"scenes": ["one", "two"], "rows": rows, "untrained": {"clamp and blur": reduced_row("", 0, 0.11)}}
+    (tmp_path / "paper.json").write_text(json.dumps(document), "utf-8")
+    monkeypatch.setattr(tables, "PAPER", tmp_path / "paper.json")
+    monkeypatch.setattr(tables, "blurred_scenes", lambda: {("val2", "s"): True, ("shared", "t"): True})
+    told = " ".join(tables.training().split())
+    assert "3,000 steps of 2 crops of 64 x 64 pixels, 300 CPU seconds, on 2 procedural scenes" in told
+    assert "of the 4 networks, 2 on 14 of our own and 2 on 12 further have a lower relMSE" in told
+    told = " ".join(tables.agreement().split())
+    assert "on both sets of scenes PIXELGATHER; on neither OPTIMIZED." in told
+    assert "+10 % SMAPE and +10 % relMSE on 14 of our own" in tables.losses_sentence()
+    rows["LAYER"]["steps"] = 250
+    (tmp_path / "paper.json").write_text(json.dumps(document), "utf-8")
+    with pytest.raises(ValueError, match="differ in steps"):
+        tables.training()
 
 
 def test_layers_are_judged_where_depth_mixes(tmp_path: Path) -> None:
