@@ -2,15 +2,16 @@
 """What modelling only what a scene needs saves, and what it costs: one row for each saving.
 
     python benchmarks/bench_adapting.py FOLDER... [--model fast] [--repeats 3] [--contexts FULL HALF]
-                                        [--json docs/results/adapting.json]
+                                        [--json docs/results/adapting.json] [--halves [GLOB]]
 
 A FOLDER holds NAME.deep.exr with NAME.ref.exr. docs/tables.py makes the table of docs/adapting.md of the JSON. Each
 saving is measured on the scenes where the survey chooses it and, forced, on those where it does not. Scenes that need
-less are also made of the others: crops in which depth does not mix, and frames of several tiles whose upper half is
-plain sky or holds no samples. What a context at half resolution saves no single network can tell: FULL and HALF are the
-weights of two that differ in that alone, such as full-resolution.1 and base.1 of ablations.py. Time is the CPU time of
-the network, the runs with and without a saving taking turns, medians; error is relMSE, its ratio averaged
-geometrically.
+less are also made of the others: crops in which depth does not mix, and frames of several tiles whose upper half is a
+sky of one colour, a sky whose colour changes smoothly, or holds no samples. `--halves` measures these frames alone and
+leaves the other rows of the JSON as they are. What a context at half resolution saves no single network can tell: FULL
+and HALF are the weights of two that differ in that alone, such as full-resolution.1 and base.1 of ablations.py. Time is
+the CPU time of the network, the runs with and without a saving taking turns, medians; error is relMSE, its ratio
+averaged geometrically.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator
+from fnmatch import fnmatch
 from pathlib import Path
 from statistics import median
 
@@ -48,6 +50,9 @@ from pipelines.tiles import Band
 CROP = 96  # pixels along the side of a crop
 FEW_MIXED = 0.002  # of the pixels of a crop in which depth does not mix
 TILED = 768  # pixels along the side of a frame made of tiles, at least
+HALVES = PLAIN_SKY, SMOOTH_SKY, EMPTY = "plain sky above", "smooth sky above", "no samples above"
+HALVED = 4  # scenes that such frames are made of
+ZENITH, HORIZON, GLOW = np.array([0.15, 0.35, 0.9]), np.array([0.9, 0.95, 1.0]), 1.5
 COMPANIONS = frozenset({"coc", "lens", "motion", "time"})
 
 
@@ -184,30 +189,56 @@ def crops(scene: Scene) -> Iterator[Scene]:
                 return
 
 
-def halves(scene: Scene) -> tuple[Scene, Scene, Scene]:
-    """Tiles of a scene; the same under a plain sky; and with no samples in the sky's place."""
+def smooth_sky(samples: PathSamples) -> np.ndarray:
+    """(N, 3) float32: radiance of a clear sky where each sample, anywhere in its pixel, sees it.
+
+    It pales from the zenith, in the first row, to the horizon in the middle of the frame, and glows around a sun that
+    is out of the picture: no two samples are alike, but those of a pixel nearly are.
+    """
+    height, width = samples.counts.shape
+    pixel = np.repeat(np.arange(height * width), samples.counts.ravel())
+    place = np.stack([pixel // width, pixel % width], 1) + np.random.default_rng(0).random((len(pixel), 2))
+    down, across = 2 * place[:, 0] / height, place[:, 1] / width  # 0..1 from the zenith, from the left
+    color = ZENITH + (HORIZON - ZENITH) * np.minimum(down, 1)[:, None] ** 2
+    glow = GLOW * np.exp(-((across - 1) ** 2 + (down + 0.2) ** 2) / 0.5)
+    return (color + glow[:, None]).astype(np.float32)
+
+
+def tiled(scene: Scene) -> Scene:
+    """Tiles of a scene, a frame of TILED pixels or more along a side."""
     rows, columns = (np.tile(np.arange(size), -(-TILED // size)) for size in scene.samples.counts.shape)
-    whole = picked(scene.samples, rows, columns)
-    height, width = whole.counts.shape
-    upper = np.zeros((height, width), np.bool_)
-    upper[: height // 2] = True
-    inside = np.repeat(upper.ravel(), whole.counts.ravel())
-    roles = {role: np.where(inside[:, None], np.float32(0.5 if role == "radiance" else 0), values)
-             for role, values in whole.roles.items()}
-    sky = dataclasses.replace(whole, roles=roles, coverage=np.where(inside, np.float32(0), whole.coverage))
-    empty = dataclasses.replace(whole, counts=np.where(upper, 0, whole.counts).astype(np.int32),
-                                weight=whole.weight[~inside], coverage=whole.coverage[~inside],
-                                roles={role: values[~inside] for role, values in whole.roles.items()})
-    return (Scene.of(scene.name, whole, None), Scene.of(scene.name, sky, None), Scene.of(scene.name, empty, None))
+    return Scene.of(scene.name, picked(scene.samples, rows, columns), None)
 
 
-def table(bench: Bench, scenes: list[Scene], contexts: tuple[Denoiser, ...], note: Callable[[str], None]) -> list[Row]:
+def half(frame: Scene, name: str) -> Scene:
+    """A frame with something of HALVES in the place of its upper half."""
+    samples = frame.samples
+    upper = np.zeros(samples.counts.shape, np.bool_)
+    upper[: len(upper) // 2] = True
+    inside = np.repeat(upper.ravel(), samples.counts.ravel())
+    if name == EMPTY:
+        less = dataclasses.replace(samples, counts=np.where(upper, 0, samples.counts).astype(np.int32),
+                                   weight=samples.weight[~inside], coverage=samples.coverage[~inside],
+                                   roles={role: values[~inside] for role, values in samples.roles.items()})
+        return Scene.of(frame.name, less, None)
+    radiance = np.float32(0.5) if name == PLAIN_SKY else smooth_sky(samples)
+    roles = {role: np.where(inside[:, None], radiance if role == "radiance" else np.float32(0), values)
+             for role, values in samples.roles.items()}
+    sky = dataclasses.replace(samples, roles=roles, coverage=np.where(inside, np.float32(0), samples.coverage))
+    return Scene.of(frame.name, sky, None)
+
+
+class Rows(dict[tuple[str, str], Row]):
+    """Rows by saving and scenes, made when they are asked for."""
+
+    def __call__(self, label: str, where: str) -> Row:
+        return self.setdefault((label, where), Row(label, where))
+
+
+def savings(bench: Bench, scenes: list[Scene], contexts: tuple[Denoiser, ...], note: Callable[[str], None]
+            ) -> list[Row]:
     """Every saving on every scene; `contexts` are of full and half resolution, or none."""
-    rows: dict[tuple[str, str], Row] = {}
-
-    def row(label: str, where: str) -> Row:
-        return rows.setdefault((label, where), Row(label, where))
-
+    row = Rows()
     for scene in scenes:
         note(scene.name)
         decided, zeros, cells = decide(scene.seen), zero_roles(scene.seen), scene.seen.cells
@@ -231,19 +262,24 @@ def table(bench: Bench, scenes: list[Scene], contexts: tuple[Denoiser, ...], not
         if contexts:
             full, half = (Choice(net) for net in contexts)
             bench.measure(row("context at half resolution", "all, reduced networks"), scene, half, base=full)
-    for scene in scenes[:: max(len(scenes) // 4, 1)]:
-        whole_frame, *less = halves(scene)
-        for half, name in zip(less, ("plain sky above", "no samples above"), strict=True):
+    return list(row.values())
+
+
+def halved(bench: Bench, scenes: list[Scene], note: Callable[[str], None], match: str) -> list[Row]:
+    """What passes of frames made of these scenes whose upper half holds nothing to do, those whose name matches."""
+    row = Rows()
+    for scene in scenes:
+        whole = tiled(scene)
+        for name in (name for name in HALVES if fnmatch(name, match)):
             note(f"{scene.name}, {name}")
-            cells = half.seen.cells
-            bench.measure(row("cells pass", name), half, Choice(cells=cells), ~cells.mask)
-            whole, passed = row("cells pass", f"{name}, against a full frame"), []
-            for _ in range(bench.repeats):
-                whole_time, part_time = bench.run(whole_frame, PLAIN)[1], bench.run(half, Choice(cells=cells))[1]
-                passed.append((whole_time, part_time))
-            whole.before.append(median(a for a, _ in passed))
-            whole.after.append(median(b for _, b in passed))
-    return list(rows.values())
+            less = half(whole, name)
+            cells = less.seen.cells
+            bench.measure(row("cells pass", name), less, Choice(cells=cells), ~cells.mask)
+            runs = [(bench.run(whole, PLAIN)[1], bench.run(less, Choice(cells=cells))[1]) for _ in range(bench.repeats)]
+            against = row("cells pass", f"{name}, against a full frame")
+            against.before.append(median(before for before, _ in runs))
+            against.after.append(median(after for _, after in runs))
+    return list(row.values())
 
 
 def main() -> None:
@@ -253,23 +289,42 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--contexts", nargs=2, default=(), metavar=("FULL", "HALF"))
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--halves", nargs="?", const="*", metavar="GLOB",
+                        help="only frames whose upper half holds nothing to do, those whose name matches")
     options = parser.parse_args()
-    bench, scenes = Bench(options.model, options.repeats), []
+    paths: list[Path] = []
     for folder in options.folders:
-        paths = [path for path in sorted(folder.glob(f"*{DEEP}")) if reference_of(path).exists()]
-        if not paths:
+        found = [path for path in sorted(folder.glob(f"*{DEEP}")) if reference_of(path).exists()]
+        if not found:
             sys.exit(f"ERROR: {folder}: no NAME.deep.exr with a NAME.ref.exr beside it")
-        scenes += [bench.load(path) for path in paths]
+        paths += found
+    bench, few = Bench(options.model, options.repeats), paths[:: max(len(paths) // HALVED, 1)]
+    scenes = {path: bench.load(path) for path in (few if options.halves else paths)}
     contexts = tuple(zoo.find(name).load().eval() for name in options.contexts)
-    rows = table(bench, scenes, contexts, lambda text: print(text, file=sys.stderr))
+
+    def note(text: str) -> None:
+        print(text, file=sys.stderr)
+
+    rows = [] if options.halves else savings(bench, list(scenes.values()), contexts, note)
+    rows += halved(bench, [scenes[path] for path in few], note, options.halves or "*")
     print("| saving | scenes | number | CPU s without | saved | relMSE | largest change outside |\n" + "|---" * 7 + "|")
     print("\n".join(row.line() for row in rows))
     if options.json:
-        decisions = {scene.name: {"one_layer": decide(scene.seen).one_layer, "held": sorted(decide(scene.seen).held),
-                                  "cells_passed": int(scene.seen.cells.passed.sum()),
-                                  "cells": int(scene.seen.cells.passed.size)} for scene in scenes}
-        options.json.write_text(json.dumps({"decisions": decisions, "rows": [dataclasses.asdict(row) for row in rows]},
-                                           indent=1) + "\n")
+        write(options.json, list(scenes.values()), rows, keep=options.halves is not None)
+
+
+def write(path: Path, scenes: list[Scene], rows: list[Row], keep: bool) -> None:
+    """The JSON; with `keep`, what it holds already and was not measured again stays."""
+    decisions = {scene.name: {"one_layer": decide(scene.seen).one_layer, "held": sorted(decide(scene.seen).held),
+                              "cells_passed": int(scene.seen.cells.passed.sum()),
+                              "cells": int(scene.seen.cells.passed.size)} for scene in scenes}
+    lines = [dataclasses.asdict(row) for row in rows]
+    if keep and path.exists():
+        new, old = {(row.label, row.scenes) for row in rows}, json.loads(path.read_text("utf-8"))
+        lines = [*(row for row in old["rows"] if (row["label"], row["scenes"]) not in new), *lines]
+        decisions = {**old["decisions"], **decisions}
+    document = {"decisions": decisions, "rows": lines}
+    path.write_text(json.dumps(document, indent=1) + "\n")
 
 
 if __name__ == "__main__":

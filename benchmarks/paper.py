@@ -5,8 +5,9 @@
 
 DATA is a folder of training scenes; its cache is built beside it, as by `lbmc train`. Every FOLDER of scenes is scored
 at 8 samples per pixel. Each network that is done is a row of docs/results/paper.json (`--json`), from which
-docs/tables.py makes the tables of docs/results.md; rows that exist are kept, and a run that was stopped resumes from
-its checkpoint in WORK. The scenes that the first run trains on are those of all later ones.
+docs/tables.py makes the tables of docs/results.md (elsewhere: benchmarks/keep_paper.py takes them there); rows that
+exist are kept, and a run that was stopped resumes from its checkpoint in WORK. The scenes that the first run trains on
+are those of all later ones.
 """
 
 from __future__ import annotations

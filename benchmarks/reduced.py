@@ -19,7 +19,7 @@ SMAPE = LossWeights(smape=1.0, relative=0.0, pooled=())
 TONE_MAPPED = LossWeights(smape=0.0, relative=0.0, tone_mapped=1.0, pooled=())
 PLAIN = Augmentation(permute_colors=False, drop_roles=0.0, fireflies=0.0)
 """Flips, quarter turns and random exposure, no more."""
-PAPER_RECIPE = Recipe(steps=250, batch=2, crop=64, samples=((8, 1.0),), loss=SMAPE, augmentation=PLAIN,
+PAPER_RECIPE = Recipe(steps=3000, batch=2, crop=64, samples=((8, 1.0),), loss=SMAPE, augmentation=PLAIN,
                       partition_entropy=0.0)
 OUR_RECIPE = Recipe(steps=200, batch=2, crop=96, samples=((8, 1.0),), augmentation=PLAIN)
 

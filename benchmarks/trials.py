@@ -10,9 +10,10 @@ import argparse
 import dataclasses
 import json
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatch
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from model.config import Config
 from model.cost import count
 from model.metrics import common_scale, relmse, relmse_trimmed, smape
 from pipelines.allocator import keep_freed_memory
-from pipelines.bench.methods import BlurMethod, FlatMethod, LbmcMethod, Method
+from pipelines.bench.methods import BlurMethod, FlatMethod, LbmcMethod, Method, OidnMethod, oidn_installed
 from pipelines.bench.results import own
 from pipelines.bench.scenes import find_scenes, write_thinned
 from pipelines.flat_pictures import read_rgb
@@ -42,6 +43,13 @@ SAVE_EVERY = 100  # steps
 Row = dict[str, Any]
 Scenes = list[tuple[str, Path, Path]]
 """Name, deep file, reference."""
+YARDSTICK = "OIDN + albedo, normal"
+UNTRAINED: Mapping[str, Callable[[int], Method]] = {
+    "samples' mean": FlatMethod,
+    "clamp and blur": BlurMethod,
+    **({YARDSTICK: partial(OidnMethod, "guided")} if oidn_installed() else {}),
+}
+"""What is not trained here, made for so many threads: what a network stands beside."""
 
 
 @dataclass(frozen=True)
@@ -123,10 +131,13 @@ def network(weights: Path) -> LbmcMethod:
     return LbmcMethod(str(weights), torch.get_num_threads(), {"adapt": False})
 
 
-def untrained(sets: dict[str, Scenes], folder: Path) -> Row:
-    """Errors of what needs no training, by name: rows that any network should be ahead of."""
-    methods = {"samples' mean": FlatMethod, "clamp and blur": BlurMethod}
-    return {name: {"scenes": scores(kind(torch.get_num_threads()), sets, folder)[0]} for name, kind in methods.items()}
+def untrained(name: str, sets: dict[str, Scenes], folder: Path) -> Row:
+    """Errors of one of UNTRAINED."""
+    method = UNTRAINED[name](torch.get_num_threads())
+    try:
+        return {"scenes": scores(method, sets, folder)[0]}
+    finally:
+        method.close()
 
 
 def scores(method: Method, sets: dict[str, Scenes], folder: Path) -> tuple[Row, float]:
@@ -193,9 +204,10 @@ def perform(description: str, runs: Iterable[Run], rows: Path,
     if options.json.exists():
         document = json.loads(options.json.read_text("utf-8"))
     document["scenes"] = document["scenes"] or [entry.name for entry in cache.entries]
-    if "untrained" not in document:
-        document["untrained"] = untrained(sets, options.work)
-        write(options.json, document)
+    for name in UNTRAINED:
+        if name not in document.setdefault("untrained", {}):
+            document["untrained"][name] = untrained(name, sets, options.work)
+            write(options.json, document)
     for run in runs:
         wanted = any(fnmatch(run.name, glob) for glob in options.only or ["*"])
         if run.key in document["rows"] or not wanted or options.seed not in (None, run.recipe.seed):

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from paper_tables import listed, paragraph
 from result_tables import markdown
 
 from model.metrics import geometric_mean
@@ -30,4 +31,14 @@ def _line(row: Mapping[str, Any]) -> list[str]:
     return [row["label"], row["scenes"], str(len(row["before"])), f"{100 * saved:.0f} %", error, change]
 
 
-ADAPTING_TABLES: Mapping[str, Callable[[], str]] = {"adapting": savings}
+def halves() -> str:
+    """How much less of the network's time a frame takes whose upper half holds nothing to do: a sentence."""
+    against = ", against a full frame"
+    saved = {row["scenes"].removesuffix(against): 1 - sum(row["after"]) / sum(row["before"])
+             for row in json.loads(RESULTS.read_text("utf-8"))["rows"] if row["scenes"].endswith(against)}
+    told = [f"{100 * share:.0f} % with {name.removesuffix(' above')}" for name, share in saved.items()]
+    return paragraph("Against a full frame of 768 x 768 pixels, one whose upper half holds nothing to do takes less of "
+                     f"the network's time by {listed(told)}.")
+
+
+ADAPTING_TABLES: Mapping[str, Callable[[], str]] = {"adapting": savings, "adapting-halves": halves}

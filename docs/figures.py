@@ -4,14 +4,16 @@
     python docs/figures.py [RESULTS.json] [--out FOLDER]
 
 RESULTS.json is what `lbmc bench` wrote, results.json of this repository if none is named. Charts go to docs/images:
-speed.png (time against error), growth.png (cost from 4 to 64 samples per pixel), and, from docs/results/samples.json,
-samples.png (error against samples per pixel). Needs the extra `bench`.
+speed.png (time against error), growth.png (cost from 4 to 64 samples per pixel); from docs/results/samples.json,
+samples.png (error against samples per pixel); and from docs/results/paper.json, paper.png (time against error of
+networks of reduced width). Needs the extra `bench`.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -24,6 +26,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import paper_tables
+
 from model.metrics import geometric_mean
 from pipelines.bench.charts import Style, number
 from pipelines.bench.report import styles
@@ -35,6 +41,13 @@ MARKERS = {"circle": "o", "square": "s", "triangle": "^", "diamond": "D"}
 GROWING = {"LAYER": "#2c5aa0", "SAMPLESPLAT": "#c0504d"}
 """The networks of the paper's Figure 10, and their colours."""
 PLAIN = Style("#8a8f98", "diamond")
+REDUCED = {
+    "clamp and blur": ("^", "#4c7a2e"), "OIDN + albedo, normal": ("s", "#d0702a"), "PIXELGATHER": ("v", "#8e44ad"),
+    "SAMPLESPLAT": ("P", "#8e44ad"), "LAYER": ("D", "#8e44ad"), "LAYER_w": ("D", "#d35d9e"),
+    "LAYER, tone-mapped L2": ("d", "#c9a0dc"), "OPTIMIZED": ("X", "#8e44ad"), "pixel aggregate": ("v", "#2f7ed8"),
+    "fast, 1 layer": ("p", "#2f7ed8"), "fast": ("o", "#2f7ed8"),
+}
+"""Markers and colours of paper.png; LAYER of other numbers of layers is on its line."""
 
 
 def load(path: Path) -> Results:
@@ -82,6 +95,29 @@ def growth(results: Results) -> Figure:
         _log_axes(axes, "samples per pixel", label, sorted({point.samples for point in results.growth}))
         axes.set_title(title, fontsize=11, loc="left")
         axes.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def reduced() -> Figure:
+    """Time against error of the networks of reduced width, on either set of scenes."""
+    figure, panels = plt.subplots(1, len(paper_tables.SETS), figsize=(12, 5.4), dpi=110, layout="constrained")
+    rows = paper_tables.load(paper_tables.PAPER)["rows"].values()
+    ours = {row["name"]: f"{row['name']}, {row['steps']} steps" for row in rows if row["group"] == "ours"}
+    for axes, (name, words) in zip(panels, paper_tables.SETS.items(), strict=True):
+        points = paper_tables.points(name)
+        layers = {count: points[label] for count, label in paper_tables.LAYERS.items() if label in points}
+        axes.plot(*zip(*layers.values(), strict=True), ".-", color="#c9a0dc", lw=1, ms=6, zorder=1,
+                  label=f"LAYER, {min(layers)} to {max(layers)} layers")
+        for count, point in layers.items():
+            axes.annotate(str(count), point, xytext=(6, -3), textcoords="offset points", fontsize=8, color="#8e44ad")
+        for label, (marker, color) in REDUCED.items():
+            if label in points:
+                axes.plot(*points[label], marker, color=color, ms=8, zorder=3, mec="white", mew=0.6,
+                          label=ours.get(label, label))
+        _log_axes(axes, "CPU seconds per megapixel", "relMSE")
+        axes.set_title(f"{words}, {paper_tables.load(paper_tables.PAPER)['times']['samples']} samples per pixel",
+                       fontsize=11, loc="left")
+    figure.legend(*panels[0].get_legend_handles_labels(), frameon=False, fontsize=9, ncol=4, loc="outside lower center")
     return figure
 
 
@@ -141,7 +177,8 @@ def save(figures: Mapping[str, Figure], folder: Path) -> None:
     """As PNGs that depend on the data alone."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in figures.items():
-        figure.tight_layout()
+        if figure.get_layout_engine() is None:
+            figure.tight_layout()
         figure.savefig(folder / f"{name}.png", metadata={"Software": None})
         plt.close(figure)
 
@@ -158,6 +195,8 @@ def main() -> None:
     samples = HOME / "docs" / "results" / "samples.json"
     if samples.exists():
         figures["samples"] = by_samples(load(samples))
+    if "times" in paper_tables.load(paper_tables.PAPER):
+        figures["paper"] = reduced()
     save(figures, options.out)
 
 

@@ -5,13 +5,14 @@
 
 layers.png: an example scene through a preset: samples by layer, filtered layers, their composite, the reference.
 visibility.png: a scene with no noise but visibility, through two networks that benchmarks/paper.py trained in WORK
-(left out without it), one of which composites its layers by alpha and one averages them, and through the preset. Needs
-the extra `bench`.
+(left out without it), one of which composites its layers by alpha and one averages them, and through the preset; its
+errors go to docs/results/visibility.json, of which docs/tables.py makes a table. Needs the extra `bench`.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
 
@@ -42,9 +43,12 @@ from pipelines.survey import exposure_of, survey
 HOME = Path(__file__).resolve().parents[1]
 IMAGES = HOME / "docs" / "images"
 SCENE = HOME / "examples" / "scenes" / "defocus-motion"
+NUMBERS = HOME / "docs" / "results" / "visibility.json"
 SIZE, SAMPLES = (160, 200), 8
 REFERENCE_PASSES, PASS_SAMPLES = 32, 32
 SEED = 4
+MIXED = 0.02  # a pixel of whose samples at least this part sees another surface than the rest has noisy visibility
+SURFACES = ("leaves", "disc", "wall")
 REDUCED = {"LAYER, reduced": "LAYER.1.safetensors", "LAYER_w, reduced": "LAYER_w.1.safetensors"}
 Picture = NDArray[np.floating]
 
@@ -121,30 +125,56 @@ def to_samples(traced: Traced) -> Samples:
                    {role: torch.from_numpy(values).float() for role, values in traced.roles.items()})
 
 
+def converged() -> tuple[Picture, Picture]:
+    """The scene of `visibility.png` without noise (H, W, 3), and what its pixels see, as `Traced.shares`."""
+    found = np.zeros((2, *SIZE, 3))
+    for k in range(REFERENCE_PASSES):
+        traced = trace(*SIZE, PASS_SAMPLES, SEED + 1 + k)
+        found += traced.mean(), traced.shares()
+    picture, seen = found / REFERENCE_PASSES
+    return picture, seen
+
+
 @torch.inference_mode()
 def draw_visibility(work: Path, model: str | None) -> None:
-    """visibility.png."""
+    """visibility.png, and its numbers."""
     traced = trace(*SIZE, SAMPLES, SEED)
-    passes = (trace(*SIZE, PASS_SAMPLES, SEED + 1 + k).mean() for k in range(REFERENCE_PASSES))
-    reference = sum(passes) / REFERENCE_PASSES
+    reference, seen = converged()
     samples, noisy = to_samples(traced), traced.mean()
     scale = FrameScale(exposure_of(noisy.astype("f4")), float(np.median(traced.roles["depth"])))
     k = common_scale(reference)
+    regions = {"mixed": seen.max(-1) <= 1 - MIXED, "wall": seen[..., 2] == 1}
+
+    def errors(picture: Picture) -> dict[str, float]:
+        found = {name: relmse(k * np.asarray(picture, "f8")[where], k * reference[where])
+                 for name, where in regions.items()}
+        return {"all": error(picture, reference), **found}
+
+    def in_front(net: Denoiser) -> dict[str, float]:
+        """How much of each surface's samples the network puts into the front layer."""
+        share = net.partition(samples, scale, 2)[:, 0].numpy()
+        return {name: float(share[surface].mean()) for name, surface in zip(SURFACES, traced.surfaces().T, strict=True)}
+
     shipped = find_weights(model)
     networks = {word: find_weights(str(work / name)) for word, name in REDUCED.items()} | {shipped.name: shipped}
+    rows: dict[str, dict[str, dict[str, float]]] = {f"noisy, {SAMPLES} samples": {"relmse": errors(noisy)}}
     figure, axes = plt.subplots(len(networks), 5, figsize=(13.6, 7.2), dpi=100)
     show(axes[0, 0], noisy, f"noisy, {SAMPLES} samples, relMSE {error(noisy, reference):.4f}", k)
     show(axes[1, 0], reference, "reference", k)
-    axes[2, 0].axis("off")
+    show(axes[2, 0], seen[..., 0] + seen[..., 1], "seen of leaves and disc, reference")
     for row, (word, weights) in enumerate(networks.items()):
-        layers = weights.load()(samples, scale, 2)
+        net = weights.load()
+        layers = net(samples, scale, 2)
         front, back = planes(layers.color)
         show(axes[row, 1], front, f"{word}: front layer", k)
         show(axes[row, 2], back, f"{word}: back layer", k)
         show(axes[row, 3], layers.weight[0, 0].numpy(), f"{word}: front layer's weight")
         show(axes[row, 4], front + back, f"{word}: sum, relMSE {error(front + back, reference):.4f}", k)
+        rows[word] = {"relmse": errors(front + back), "in_front": in_front(net)}
     figure.tight_layout()
     figure.savefig(IMAGES / "visibility.png", metadata={"Software": None})
+    parts = {name: float(where.mean()) for name, where in regions.items()}
+    NUMBERS.write_text(json.dumps({"parts": parts, "rows": rows}, indent=1) + "\n", "utf-8")
 
 
 def main() -> None:

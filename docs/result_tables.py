@@ -1,7 +1,8 @@
 """The tables of measured results: made from the JSON that benchmarks left in the repository, checked by docs/tables.py.
 
 results.json is `lbmc bench examples/scenes`; docs/results/samples.json is `lbmc bench` on scenes of 32 samples;
-docs/results/paper.json is benchmarks/paper.py's, docs/results/layers_alive.json benchmarks/layers_alive.py's.
+docs/results/layers_alive.json is benchmarks/layers_alive.py's, docs/results/visibility.json docs/layer_images.py's.
+Networks of reduced width are paper_tables.py's.
 """
 
 from __future__ import annotations
@@ -12,24 +13,23 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from model.config import LAYER
 from model.cost import count
 from model.metrics import geometric_mean
 from pipelines.bench.charts import number
+from pipelines.bench.methods import OUTSIDE, STAGES
 from pipelines.bench.results import Results, own, pareto
-from pipelines.bench.tables import FULL_HD, PUBLISHED, front_points
+from pipelines.bench.tables import FULL_HD, front_points
 
 HOME = Path(__file__).resolve().parent.parent
 BENCH, SAMPLES = HOME / "results.json", HOME / "docs" / "results" / "samples.json"
-PAPER, ALIVE = HOME / "docs" / "results" / "paper.json", HOME / "docs" / "results" / "layers_alive.json"
-PUBLISHED_LAYERS = {2: 0.0288, 3: 0.0315, 4: 0.0313, 5: 0.0332}
-"""relMSE of LAYER with so many layers as published; the paper's figure for one layer is not at hand."""
+ALIVE, VISIBILITY = (HOME / "docs" / "results" / name for name in ("layers_alive.json", "visibility.json"))
 SETS = {"val2": "14 of our own", "shared": "12 further"}
 """Sets of scenes in the JSON, and what the tables call them."""
 LEAST = 0.1
 """The front layer is to have this share of the weight at least, and at most one less it."""
+NETWORK_STAGES = {stage: words for stage, words in STAGES.items() if stage not in OUTSIDE}
+YARDSTICK = "OIDN + albedo, normal"
 BLURRED, STILL = "defocus or motion", "neither"
 Row = dict[str, Any]
 
@@ -95,6 +95,36 @@ def stages() -> str:
     return markdown(("method", "read", "flatten", "own work", "write"), rows)
 
 
+def network_stages() -> str:
+    """The paper's Table 3: CPU seconds of a frame of 1920 x 1080 by stage of each network, and the whole in OIDN's."""
+    results = Results.from_dict(load(BENCH))
+    summary = results.summary(results.groups()[0])
+    kinds = ("lbmc", "saving", "paper")
+    rows = []
+    for name in (spec.name for spec in results.methods if spec.family in kinds and spec.name in summary):
+        row = summary[name]
+        cells = [number(FULL_HD * row.cpu[stage]) if stage in row.cpu else "–" for stage in NETWORK_STAGES]
+        oidn = summary[YARDSTICK].own_cpu if YARDSTICK in summary else None
+        rows.append([name, *cells, number(FULL_HD * row.own_cpu), f"{row.own_cpu / oidn:.2f}" if oidn else "–"])
+    return markdown(("CPU s at 1080p", *NETWORK_STAGES.values(), "all", "CPU time of OIDN's"), rows)
+
+
+def memory() -> str:
+    """Peak memory of every method beyond its libraries, and what it was measured on."""
+    results = Results.from_dict(load(BENCH))
+    protocol = results.protocol
+    scene = next(scene for scene in results.scenes if scene.name == protocol["example"])
+    large = [max(size, protocol["frame"]) for size in (scene.width, scene.height)]
+    small = [protocol["untrained_frame"]] * 2
+    rows = []
+    for spec in results.methods:
+        if spec.name in results.memory:
+            width, height = large if spec.scored else small
+            taken = results.memory[spec.name]
+            rows.append([spec.name, f"{width} x {height}", f"{taken / 2**20:,.0f}", f"{taken / (width * height):,.0f}"])
+    return markdown(("method", "frame", "MiB", "bytes per pixel"), rows)
+
+
 def growth() -> str:
     """The paper's Figure 10 in numbers: million multiply-adds and CPU microseconds per pixel."""
     results = Results.from_dict(load(BENCH))
@@ -142,58 +172,6 @@ def layer_cost() -> str:
                      "8 samples, 2 layers"), rows)
 
 
-# --- the paper's comparisons ---------------------------------------------------------------------------------------
-
-
-def mean_errors(row: Row, name: str) -> list[float]:
-    """Over a set of scenes: geometric means of relMSE, plain and without its worst 0.1 % of pixels; mean SMAPE."""
-    scenes = row["scenes"][name].values()
-    return [*(geometric_mean([scene[key] for scene in scenes]) for key in ("relmse", "trimmed")),
-            float(np.mean([scene["smape"] for scene in scenes]))]
-
-
-def errors_of(row: Row) -> list[str]:
-    return [f"{value:.4f}" for name in SETS for value in mean_errors(row, name)]
-
-
-ERRORS = tuple(f"{word}, {scenes}" for scenes in SETS.values() for word in ("relMSE", "trimmed", "SMAPE"))
-
-
-def paper_rows(names: Sequence[str]) -> list[Row]:
-    """The rows of the paper's group by name, those that are there."""
-    rows = {row["name"]: row for row in load(PAPER)["rows"].values() if row["group"] == "paper"}
-    return [rows[name] for name in names if name in rows]
-
-
-def untrained_rows(columns: int) -> list[list[str]]:
-    """What needs no training, before the networks of a table with so many columns."""
-    found = [[name, *errors_of(row)] for name, row in load(PAPER)["untrained"].items()]
-    return [row + ["–"] * (columns - len(row)) for row in found]
-
-
-def variants() -> str:
-    """Table 1, and with it Table 4: OPTIMIZED against LAYER."""
-    head = ("network", *ERRORS, "multiply-adds per pixel", "CPU s a step", "relMSE as published", "SMAPE as published")
-    rows = [[row["name"], *errors_of(row), f"{row['multiply_adds'] / 1e3:.0f} k", f"{row['cpu_seconds_a_step']:.2f}",
-             *(f"{value:.4f}" for value in PUBLISHED[row["name"]])] for row in paper_rows(list(PUBLISHED))]
-    return markdown(head, [*untrained_rows(len(head)), *rows])
-
-
-def layer_counts() -> str:
-    """Table 2."""
-    names = {1: "LAYER, 1 layer", 2: "LAYER", **{n: f"LAYER, {n} layers" for n in (3, 4, 5)}}
-    rows = [[str(row["layers"]), *errors_of(row), f"{PUBLISHED_LAYERS[row['layers']]:.4f}"
-             if row["layers"] in PUBLISHED_LAYERS else "–"] for row in paper_rows(list(names.values()))]
-    return markdown(("layers", *ERRORS, "relMSE as published"), rows)
-
-
-def losses() -> str:
-    """Table 5."""
-    names = {"LAYER": "SMAPE", "LAYER, tone-mapped L2": "squared error, tone-mapped"}
-    rows = [[names[row["name"]], *errors_of(row)] for row in paper_rows(list(names))]
-    return markdown(("trained by", *ERRORS), rows)
-
-
 # --- the layers are alive ------------------------------------------------------------------------------------------
 
 
@@ -201,24 +179,6 @@ def blurred_scenes() -> dict[tuple[str, str], bool]:
     """(set, scene) -> whether it has defocus or motion."""
     return {(name, scene): row["blurred"] for name, scenes in load(ALIVE)["sets"].items()
             for scene, row in scenes.items()}
-
-
-def pairs() -> str:
-    """`fast` against others at equal steps, data and seed: ratios of relMSE, seed by seed."""
-    rows = {(row["name"], row["seed"]): row for row in load(PAPER)["rows"].values() if row["group"] == "ours"}
-    others = [name for name in dict.fromkeys(name for name, _ in rows) if name != "fast"]
-    seeds = sorted(seed for name, seed in rows if name == "fast")
-    blurred = blurred_scenes()
-    lines = []
-    for other, name, is_blurred in product(others, SETS, (True, False)):
-        scenes = [scene for (group, scene), value in blurred.items() if group == name and value == is_blurred]
-        ratios = {seed: geometric_mean([rows["fast", seed]["scenes"][name][scene]["relmse"]
-                                        / rows[other, seed]["scenes"][name][scene]["relmse"] for scene in scenes])
-                  for seed in seeds if (other, seed) in rows}
-        lines.append([f"{other}; {len(scenes)} of {SETS[name]}, {BLURRED if is_blurred else STILL}",
-                      *(f"{ratios[seed]:.3f}" if seed in ratios else "–" for seed in seeds),
-                      f"{geometric_mean(list(ratios.values())):.3f}"])
-    return markdown(("relMSE of `fast` over that of", *(f"seed {seed}" for seed in seeds), "mean"), lines)
 
 
 def alive() -> str:
@@ -253,17 +213,30 @@ def alive_count() -> str:
                      "with misses, on"), lines)
 
 
+def visibility() -> str:
+    """Errors on a scene with no noise but visibility, and where networks put the samples of its surfaces."""
+    found = load(VISIBILITY)
+    lines = []
+    for name, row in found["rows"].items():
+        shares = [f"{100 * value:.0f} %" for value in row.get("in_front", {}).values()]
+        lines.append([name, *(f"{row['relmse'][key]:.4f}" for key in ("all", *found["parts"])),
+                      *(shares or ["–"] * 3)])
+    mixed, wall = (f"{100 * value:.0f} %" for value in found["parts"].values())
+    head = ("network", "relMSE", f"where surfaces mix ({mixed})", f"where the wall is alone ({wall})",
+            "leaves in front", "disc in front", "wall in front")
+    return markdown(head, lines)
+
+
 RESULT_TABLES: Mapping[str, Callable[[], str]] = {
     "bench": bench,
     "scenes": scenes,
     "stages": stages,
+    "network-stages": network_stages,
+    "memory": memory,
     "layer-cost": layer_cost,
     "growth": growth,
     "samples": samples,
-    "paper-variants": variants,
-    "paper-layers": layer_counts,
-    "paper-losses": losses,
-    "pairs": pairs,
+    "visibility": visibility,
     "layers-alive": alive,
     "layers-alive-count": alive_count,
 }

@@ -4,7 +4,8 @@
     python docs/tables.py            says which tables differ; exit code 1 if any does
     python docs/tables.py --write    brings them up to date
 
-A table stands between the lines `<!-- table: NAME -->` and `<!-- end -->` of README.md or docs/*.md.
+A table, or a paragraph whose numbers are counted, stands between the lines `<!-- table: NAME -->` and `<!-- end -->` of
+README.md or docs/*.md.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any, get_type_hints
 
 from ablation_tables import ABLATION_TABLES
 from adapting_tables import ADAPTING_TABLES
+from paper_tables import PAPER_TABLES
 from quality_tables import QUALITY_TABLES
 from result_tables import RESULT_TABLES
 
@@ -122,6 +124,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "networks": networks,
     "recipe": recipe,
     **RESULT_TABLES,
+    **PAPER_TABLES,
     **ABLATION_TABLES,
     **ADAPTING_TABLES,
     **QUALITY_TABLES,

@@ -35,6 +35,16 @@ class Traced:
         mean: Array = self.roles["radiance"].reshape(self.height, self.width, self.per_pixel, 3).mean(2)
         return mean
 
+    def shares(self) -> Array:
+        """(H, W, 3) the part of each pixel's samples that sees leaves, the disc, the wall."""
+        shares: Array = self.surfaces().reshape(self.height, self.width, self.per_pixel, 3).mean(2)
+        return shares
+
+    def surfaces(self) -> NDArray[np.bool_]:
+        """(N, 3) whether a sample sees leaves, the disc, the wall."""
+        seen: NDArray[np.bool_] = self.roles["depth"] == np.array([LEAF_DEPTH, DISC_DEPTH, WALL_DEPTH])
+        return seen
+
 
 def trace(height: int, width: int, per_pixel: int, seed: int) -> Traced:
     """The scene with so many independent samples in every pixel."""

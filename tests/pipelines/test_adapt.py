@@ -6,8 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from deep_io import DeepSamples, Window
+from model import zoo
+from model.config import FAST
+from model.denoiser import Denoiser
 from pipelines.denoise import Job
 from pipelines.options import DenoiseOptions
 from pipelines.plan import FramePlan
@@ -139,3 +144,69 @@ def test_a_role_that_only_one_of_a_frame_and_the_deciding_one_has_is_told_once(t
     assert "in.3.exr: lacks albedo" in chunk.err
     drop = (word for role in ("normal", "albedo", "roughness", "depth") for word in ("--map", f"{role}=none"))
     assert "decided for the shot" not in in_process(*words, tmp_path / "less.#.exr", *drop).err
+
+
+class ValuesComputed(TorchDispatchMode):
+    """Counts the values that tensor operations write, in place or anew: work, whatever the clock says. Views are none.
+
+    Most of the denoiser's time goes into moving values, filter taps foremost; multiply-adds would weigh them little.
+    """
+
+    count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
+        result = func(*args, **(kwargs or {}))
+        if isinstance(result, torch.Tensor) and not func.is_view:
+            self.count += result.numel()
+        return result
+
+
+TALL = Window(0, 0, 63, 1023)
+"""Cells do their work by rows: a narrow frame shows what a wide one of as many rows would."""
+
+
+def below(background: str) -> DeepSamples:
+    """A noisy frame of 1024 rows, or only its lower half, below a sky that changes smoothly or below no samples."""
+    own_sky = 8  # rows, cut off
+    noise = noisy_scene(0, Window(TALL.xmin, TALL.ymin - own_sky, TALL.xmax, TALL.ymax), most=2)
+    first = int(noise.counts[:own_sky].sum())
+    counts, channels = noise.counts[own_sky:], {name: values[first:] for name, values in noise.channels.items()}
+    upper = np.arange(TALL.height) < TALL.height // 2
+    above = np.repeat(upper, counts.sum(1))
+    if background == "no samples":
+        channels = {name: values[~above] for name, values in channels.items()}
+        counts = np.where(upper[:, None], 0, counts).astype(np.int32)
+    if background == "smooth sky":
+        place = np.linspace(0.2, 1, int(above.sum())) + np.random.default_rng(0).uniform(-1e-3, 1e-3, int(above.sum()))
+        for name, values in channels.items():
+            channels[name] = values.copy()
+            channels[name][above] = place if name in "RGB" else 1e10 if name == "Z" else 0
+    return DeepSamples(counts, channels, TALL)
+
+
+@pytest.fixture
+def real_weights(tmp_path: Path) -> Path:
+    """Untrained weights of the widths, windows and reach that ship: the work is that of the trained ones."""
+    torch.manual_seed(0)
+    zoo.save(Denoiser(FAST), tmp_path / "fast.safetensors", {"description": "random"})
+    return tmp_path / "fast.safetensors"
+
+
+def work(folder: Path, samples: DeepSamples, weights: Path) -> int:
+    """Of the real command."""
+    source = write_scene(folder / "in.exr", samples)
+    with ValuesComputed() as computed:
+        run = in_process("denoise", source, folder / "out.exr", "--model", weights, "--layers", 2, "--overwrite",
+                         "--threads", 1, "--progress", "none")
+    assert run.code == 0, run.err
+    return computed.count
+
+
+def test_a_frame_that_is_half_empty_or_sky_takes_at_least_35_percent_less_work_than_a_full_one(
+    tmp_path: Path, real_weights: Path
+) -> None:
+    full = work(tmp_path, below("more noise"), real_weights)
+    pixels = TALL.width * TALL.height
+    assert full > 1000 * pixels  # the filter alone has hundreds of taps of a dozen values
+    for background in ("no samples", "smooth sky"):
+        assert work(tmp_path, below(background), real_weights) <= 0.65 * full, background
