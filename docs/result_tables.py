@@ -55,7 +55,7 @@ def bench() -> str:
     oidn = next((row.own_cpu for name, row in summary.items() if name.startswith("OIDN +")), None)
     rows = []
     for spec in results.methods:
-        if spec.name not in summary or spec.family == "saving":
+        if spec.name not in summary:
             continue
         row = summary[spec.name]
         error = [("–" if row.scores.get(key) is None else f"{row.scores[key]:.4f}") for key in ("relmse", "smape")]
@@ -71,7 +71,7 @@ def bench() -> str:
 def scenes() -> str:
     """relMSE / SMAPE / PSNR / energy of every scored method on every scene."""
     results = Results.from_dict(load(BENCH))
-    names = [spec.name for spec in results.methods if spec.scored and spec.family != "saving"]
+    names = [spec.name for spec in results.methods if spec.scored]
     scores = {(row.scene, row.method): row.scores for row in results.measurements if row.scores}
     rows = []
     for name in names:
@@ -99,7 +99,7 @@ def network_stages() -> str:
     """The paper's Table 3: CPU seconds of a frame of 1920 x 1080 by stage of each network, and the whole in OIDN's."""
     results = Results.from_dict(load(BENCH))
     summary = results.summary(results.groups()[0])
-    kinds = ("lbmc", "saving", "paper")
+    kinds = ("lbmc", "paper")
     rows = []
     for name in (spec.name for spec in results.methods if spec.family in kinds and spec.name in summary):
         row = summary[name]

@@ -37,14 +37,13 @@ from pipelines.progress import Progress
 
 Image = NDArray[np.floating[Any]]
 Kind = Literal["mean", "blur", "atrous", "oidn", "lbmc", "untrained"]
-Family = Literal["input", "classical", "OIDN", "lbmc", "saving", "paper"]
+Family = Literal["input", "classical", "OIDN", "lbmc", "paper"]
 
 FAMILIES: Mapping[Family, str] = {
     "input": "the samples' mean",
     "classical": "untrained filters",
     "OIDN": "Intel Open Image Denoise",
     "lbmc": "lbmc",
-    "saving": "lbmc, otherwise configured",
     "paper": "the paper's networks, random weights: time only",
 }
 
@@ -79,7 +78,6 @@ class MethodSpec:
 
     argument : a preset or weight file, an OIDN mode, or a name of PAPER
     changes : fields of DenoiseOptions that differ from the default
-    base : name of the method that a "saving" is compared with
     """
 
     name: str
@@ -87,7 +85,6 @@ class MethodSpec:
     kind: Kind
     argument: str = ""
     changes: Mapping[str, Any] = field(default_factory=dict)
-    base: str = ""
 
     @property
     def scored(self) -> bool:

@@ -197,7 +197,7 @@ def _stages(results: Results) -> list[str]:
     summary = results.summary(samples)
     rows = {name: {stage: seconds * FULL_HD for stage, seconds in row.cpu.items()} for name, row in summary.items()
             if row.cpu}
-    ours = [(name, row) for name, row in rows.items() if kinds[name] not in ("paper", "input", "saving")]
+    ours = [(name, row) for name, row in rows.items() if kinds[name] not in ("paper", "input")]
     networks = [(name, row) for name, row in rows.items() if kinds[name] in ("paper", "lbmc")]
     charts = [_figure(f"Read, work, write, {_scenes(results, samples)}, scaled to 1920 x 1080",
                       bars(ours, STAGE_COLORS, STAGES, "CPU s"))]

@@ -71,7 +71,7 @@ def methods_table(results: Results, samples: int) -> Table:
     front = pareto(front_points(results, samples))
     rows = []
     for spec in results.methods:
-        if spec.name not in summary or spec.family == "saving":
+        if spec.name not in summary:
             continue
         row = summary[spec.name]
         idle = spec.family == "input" or not row.cpu
@@ -94,7 +94,7 @@ def methods_table(results: Results, samples: int) -> Table:
 def unbiased_table(results: Results, samples: int) -> Table:
     """relMSE on every scene whose reference has two halves: plain, and free of the reference's noise."""
     found = results.unbiased(samples)
-    names = [spec.name for spec in results.methods if spec.scored and spec.family != "saving"]
+    names = [spec.name for spec in results.methods if spec.scored]
     scores = {(row.scene, row.method): row.scores for row in results.measurements if row.scores}
     floors = {scene.name: scene.floor for scene in results.scenes_of(samples) if scene.floor is not None}
     rows = []
@@ -123,7 +123,7 @@ def front_points(results: Results, samples: int) -> dict[str, tuple[float, float
     for spec in results.methods:
         row = summary.get(spec.name)
         error = row.scores.get("relmse") if row else None
-        if row and row.cpu and error is not None and spec.family not in ("input", "saving"):
+        if row and row.cpu and error is not None and spec.family != "input":
             points[spec.name] = (row.own_cpu, error)
     return points
 
