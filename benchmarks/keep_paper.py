@@ -4,17 +4,15 @@
     python benchmarks/keep_paper.py [ROWS.json] [--group paper] [--work WORK] [--model fast]
 
 The rows of one group in ROWS.json take the place of all rows of that group in docs/results/paper.json; what else is
-there stays, times and other groups among it. Rows of other scenes, or of steps that differ, are refused: a
-table compares them. WORK is where
-benchmarks/paper.py left its weights; with it the pictures of layers are drawn anew, through two of these. Then charts
-and tables are. Without ROWS.json, of the rows that are there.
+there stays, times and other groups among it. Rows of other scenes, or of steps that differ, are refused: a table
+compares them. WORK is where benchmarks/paper.py left its weights; with it the pictures of layers are drawn anew,
+through two of these. Then charts and tables are. Without ROWS.json, of the rows that are there.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,11 +20,10 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from paper import ROWS
+from scripts import run_script
 from trials import Row, write
 
 from deep_io.errors import InputError, LbmcError
-
-HOME = Path(__file__).resolve().parents[1]
 
 
 def replaced(kept: Mapping[str, Row], found: Mapping[str, Row], group: str) -> Row:
@@ -57,13 +54,9 @@ def main() -> None:
     if options.json != ROWS:
         return
     if options.work:
-        _script("docs/layer_images.py", "--model", options.model, "--work", options.work)
-    _script("docs/figures.py")
-    _script("docs/tables.py", "--write")
-
-
-def _script(path: str, *words: object) -> None:
-    subprocess.run([sys.executable, HOME / path, *map(str, words)], check=True)
+        run_script("docs/layer_images.py", "--model", options.model, "--work", options.work)
+    run_script("docs/figures.py")
+    run_script("docs/tables.py", "--write")
 
 
 if __name__ == "__main__":

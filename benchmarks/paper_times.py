@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
 import sys
 import tempfile
 from collections.abc import Mapping
@@ -32,9 +31,14 @@ from model import zoo
 from model.config import Config
 from model.denoiser import Denoiser
 from pipelines.allocator import keep_freed_memory
+from pipelines.bench.attempts import Attempts
+from pipelines.bench.clock import Times
 from pipelines.bench.machine import machine
 from pipelines.bench.methods import OUTSIDE, LbmcMethod, Method
-from pipelines.bench.scenes import open_scene, write_enlarged
+from pipelines.bench.results import Gap
+from pipelines.bench.scenes import open_scene
+from pipelines.bench.timing import TimedFrame, enlarged, take_turns
+from pipelines.progress import make_progress
 from pipelines.scene_names import DEEP, REFERENCE
 
 SCENE = Path(__file__).resolve().parents[1] / "examples" / "scenes" / "defocus-motion"
@@ -65,16 +69,21 @@ def untrained_network(config: Config, folder: Path, threads: int) -> LbmcMethod:
     return LbmcMethod(str(weights), threads, {"adapt": False})
 
 
-def measure(methods: Mapping[str, Method], source: Path, target: Path, repeats: int) -> dict[str, float]:
-    """Median CPU seconds of each method's own work on a frame; all take turns, once to warm up."""
-    seconds: dict[str, list[float]] = {name: [] for name in methods}
-    for turn in range(repeats + 1):
-        for name, method in methods.items():
-            method.run(source, target)
-            stages = method.clock.take().cpu
-            seconds[name].append(sum(value for stage, value in stages.items() if stage not in NOT_THE_NETWORK))
-        print(f"{'warmed up' if turn == 0 else f'{turn} of {repeats}'}", file=sys.stderr, flush=True)
-    return {name: statistics.median(values[1:]) for name, values in seconds.items()}
+def measure(methods: Mapping[str, Method], frame: TimedFrame, target: Path, repeats: int) -> dict[str, float]:
+    """CPU seconds per megapixel of each network on a frame, by turns. Raises LbmcError where one fails."""
+
+    def run(name: str, source: Path) -> Times:
+        methods[name].run(source, target)
+        return methods[name].clock.take()
+
+    gaps: list[Gap] = []
+    with make_progress("plain", 1 + repeats) as progress:
+        found = take_turns({(frame.name, name): frame for name in methods}, repeats, run, Attempts(gaps, progress),
+                           progress)
+    if gaps:
+        raise LbmcError(f"{gaps[0].cell}: {gaps[0].why}")
+    return {name: sum(seconds for stage, seconds in times.cpu.items() if stage not in NOT_THE_NETWORK)
+            / frame.megapixels for (_, name), times in found.items()}
 
 
 def times(frame: int, repeats: int, threads: int) -> dict[str, Any]:
@@ -83,15 +92,12 @@ def times(frame: int, repeats: int, threads: int) -> dict[str, Any]:
     keep_freed_memory()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        source = folder / f"frame{DEEP}"
         scene = open_scene(SCENE.with_name(SCENE.name + DEEP), SCENE.with_name(SCENE.name + REFERENCE))
         if scene.samples != SAMPLES:
             raise InputError(f"{scene.source}: {scene.samples} samples per pixel, not {SAMPLES}")
-        megapixels = write_enlarged(scene, frame, source)
         methods: dict[str, Method] = {name: kind(threads) for name, kind in UNTRAINED.items() if name != IDLE}
         methods |= {name: untrained_network(config, folder, threads) for name, config in networks().items()}
-        found = {name: seconds / megapixels for name, seconds in
-                 measure(methods, source, folder / "out.exr", repeats).items()}
+        found = measure(methods, enlarged(scene, frame, folder), folder / "out.exr", repeats)
         for method in methods.values():
             method.close()
     found = {**{name: found[name] for name in UNTRAINED if name in found}, **same(found)}

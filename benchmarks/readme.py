@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -26,6 +25,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "docs"))
 
 import figures
+from scripts import run_script
 
 from deep_io.errors import LbmcError
 from pipelines.bench.job import RESULTS, bench
@@ -96,13 +96,9 @@ def refresh(scenes: list[str], work: Path | None, threads: int, progress: Progre
             found = bench(BenchOptions(folder, Path(out), match=MANY, threads=threads, repeats=1, frame=0, paper=False,
                                        savings=False, memory=False, growth=(), flip=False, progress=progress))
             kept &= keep(found, Path(out) / RESULTS, SAMPLES)
-    _script("benchmarks/layers_alive.py", *scenes)
-    _script("docs/layer_images.py", *(() if work is None else ("--work", work)))
+    run_script("benchmarks/layers_alive.py", *scenes)
+    run_script("docs/layer_images.py", *(() if work is None else ("--work", work)))
     return kept
-
-
-def _script(path: str, *words: object) -> None:
-    subprocess.run([sys.executable, HOME / path, *map(str, words)], check=True)
 
 
 def main() -> int:
@@ -132,8 +128,8 @@ def main() -> int:
         code = 0
         if options.scenes:
             code = int(not refresh(options.scenes, options.work, options.threads, progress))
-        _script("docs/figures.py")
-        _script("docs/tables.py", "--write")
+        run_script("docs/figures.py")
+        run_script("docs/tables.py", "--write")
     return code
 
 

@@ -235,6 +235,7 @@ class Bench:
                         scene.name, spec.name, found, times.cpu, times.wall, turns[scene.name, spec.name].megapixels))
                 elif found is not None:
                     self.results.measurements.append(Measurement(scene.name, spec.name, found, {}, {}, 0.0))
+
     def _curve(self, scene: Scene, most: int) -> None:
         thinned = self.attempts(EVERY_METHOD, scene.name, "samples", partial(self._thinned, scene, most))
         for spec in self.specs:

@@ -161,8 +161,8 @@ class Results:
             [CurvePoint(**row) for row in data["curve"]], [GrowthPoint(**row) for row in data["growth"]],
             dict(data["memory"]),
             [SavingPoint(**{**row, "relmse": tuple(row["relmse"]), "smape": tuple(row["smape"])})
-             for row in data.get("savings", [])],
-            dict(data.get("failed", {})), [Gap(**row) for row in data.get("gaps", [])],
+             for row in data["savings"]],
+            dict(data["failed"]), [Gap(**row) for row in data["gaps"]],
         )
 
     def groups(self) -> list[int]:
