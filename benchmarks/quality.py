@@ -4,7 +4,8 @@
     python benchmarks/quality.py FOLDER [--model fast] [--json OUT.json] [--panels DIR]
 
 Prints one Markdown row per scene and method (relMSE / SMAPE / PSNR / energy), and for each number of samples per pixel
-the geometric mean of relMSE and the means of the others. Errors are those of model/metrics.py.
+the geometric mean of relMSE and the means of the others. Errors are those of model/metrics.py; where NAME.ref2.exr is
+there as well, the reference is the mean of both, and the JSON has the error free of its noise.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ import numpy as np
 from deep_io.errors import LbmcError
 from deep_io.path_samples import PathSamples, SampleReader
 from model.baseline import clamp_and_blur, pixel_means
-from model.metrics import Scores, geometric_mean, score
+from model.metrics import Scores, geometric_mean
 from pipelines.bench.results import spread
+from pipelines.bench.scenes import open_scene
 from pipelines.flat_pictures import read_rgb
 from pipelines.oidn import Oidn
 from pipelines.options import DenoiseOptions
@@ -161,17 +163,17 @@ def main() -> None:
         for path in find_scenes(options.folder, options.match):
             with SampleReader(path, threads=options.threads) as reader:
                 scene = Scene(path, reader.read())
-            reference = read_rgb(reference_of(path)).rgb
+            truth = open_scene(path, reference_of(path))
             pictures: dict[str, Picture] = {}
             for name, method in methods.items():
                 started = time.process_time()
                 pictures[name] = method(scene)
                 seconds[name] += time.process_time() - started
-            row = {name: score(picture, reference, with_flip=options.flip) for name, picture in pictures.items()}
+            row = {name: truth.score(picture, with_flip=options.flip) for name, picture in pictures.items()}
             results.setdefault(scene.per_pixel, {})[scene.name] = row
             print(f"{scene.name}: " + "; ".join(f"{name} {row[name].relmse:.4f}" for name in row), file=sys.stderr)
             if options.panels:
-                write_panel(options.panels, scene.name, pictures, row, reference)
+                write_panel(options.panels, scene.name, pictures, row, truth.reference.rgb)
     print(table(results, list(methods)))
     print("\nCPU s in all: " + ", ".join(f"{name} {spent:.1f}" for name, spent in seconds.items()))
     if options.json:

@@ -17,6 +17,7 @@ from lbmc_cli.report import end_job
 @option("--seed", type=click.IntRange(0), default=1, show_default=True, help="First seed; each example has its own.")
 @option("--samples", type=click.IntRange(1), default=32, show_default=True, help="Path samples stored per pixel.")
 @option("--reference", type=click.IntRange(1), default=128, show_default=True, help="Reference paths per pixel.")
+@option("--halves", is_flag=True, help="Another reference of as many paths, NAME.ref2.exr: bench and train use both.")
 @option("--size", type=click.IntRange(16), default=192, show_default=True, help="Pixels along a side.")
 @option(
     "--scene",

@@ -31,7 +31,7 @@ Picture = npt.NDArray[np.uint8]
 
 def strip(stem: Path) -> Picture:
     """One example's pictures side by side, (H, 4 W, 3). Raises InputError for files that cannot be read."""
-    deep, reference_path, _ = example_files(stem)
+    deep, reference_path, *_ = example_files(stem)
     samples, _ = read_deep(deep, channels=CHANNELS)
     height, width = samples.counts.shape
     flat = read_flat(reference_path).channels

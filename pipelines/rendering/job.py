@@ -104,8 +104,9 @@ def render_scenes(options: RenderOptions, progress_kind: ProgressKind = "auto",
                   report: Callable[[str], None] | None = None) -> JobReport[str]:
     """Render every example of the options that is not there yet, then a contact sheet of all.
 
-    An example is NAME.deep.exr, NAME.ref.exr and NAME.json; its JSON comes last and marks it complete, so a job that
-    was stopped goes on where it was. `report` is told each example's line; the progress's notes by default.
+    An example is NAME.deep.exr, NAME.ref.exr, with the setting `halves` NAME.ref2.exr, and NAME.json; its JSON comes
+    last and marks it complete, so a job that was stopped goes on where it was. `report` is told each example's line;
+    the progress's notes by default.
     Raises UsageError for settings or a scene that differ from those of examples already there, InputError for a bad
     scene file.
     """
@@ -151,18 +152,25 @@ def _check(options: RenderOptions) -> None:
 
 def _is_complete(options: RenderOptions, seed: int, digest: str | None) -> bool:
     """Whether the example is there. Raises UsageError when it is, but rendered otherwise, or of a scene file of another
-    `digest`; an example that names none has that of its scene file's name."""
-    *_, about_path = files = example_files(example_stem(options.outdir, seed))
+    `digest`; an example that names none has that of its scene file's name. One that lacks but the other half of its
+    reference is not there, one that has it and need not is."""
+    stem = example_stem(options.outdir, seed)
+    *_, about_path = files = example_files(stem)
     if not all(path.exists() for path in files):
         return False
     try:
         about: dict[str, Any] = json.loads(about_path.read_text())
-        rendered, rendered_of = (about.get("scene"), about.get("settings")), about.get("scene_digest", digest)
-    except (ValueError, AttributeError) as error:
+        rendered, rendered_of = (about.get("scene"), _but_halves(about["settings"])), about.get("scene_digest", digest)
+    except (ValueError, AttributeError, KeyError, TypeError) as error:
         raise InputError(f"{about_path}: is not an example's JSON; delete it to render the example again") from error
-    if rendered != (options.scene and options.scene.name, asdict(options.settings)):
+    if rendered != (options.scene and options.scene.name, _but_halves(asdict(options.settings))):
         raise UsageError(f"{about_path}: was rendered with other settings; choose another folder or other seeds")
     if rendered_of != digest:
         raise UsageError(f"{about_path}: was rendered of {options.scene} before that changed, or of another file of "
                          f"its name; choose another folder or other seeds")
-    return True
+    return all(path.exists() for path in example_files(stem, options.settings.halves))
+
+
+def _but_halves(settings: dict[str, Any]) -> dict[str, Any]:
+    """What decides everything but whether there is a second reference."""
+    return {name: value for name, value in settings.items() if name != "halves"}

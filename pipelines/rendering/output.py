@@ -1,4 +1,4 @@
-"""A rendered example's files: NAME.deep.exr, NAME.ref.exr and NAME.json, each whole or not there.
+"""A rendered example's files: NAME.deep.exr, NAME.ref.exr, at times NAME.ref2.exr, and NAME.json, each whole or none.
 
 The JSON comes last, so its presence means that the example is complete.
 """
@@ -15,7 +15,7 @@ from deep_io import DeepSamples, Window, write_deep
 from deep_io.atomic import atomic_output
 from deep_io.flat import HALF_MAX, write_flat
 from pipelines.rendering.shots import Shot
-from pipelines.scene_names import DEEP, REFERENCE
+from pipelines.scene_names import DEEP, OTHER_HALF, REFERENCE
 
 
 def deep_samples(channels: dict[str, npt.NDArray[np.float32]], size: int) -> DeepSamples:
@@ -27,19 +27,21 @@ def deep_samples(channels: dict[str, npt.NDArray[np.float32]], size: int) -> Dee
     return DeepSamples(counts, typed, Window(0, 0, size - 1, size - 1))
 
 
-def example_files(stem: Path) -> tuple[Path, Path, Path]:
-    """The deep file, the reference and the JSON of the example `stem` (a path without extension)."""
-    deep, reference, about = (stem.with_name(stem.name + end) for end in (DEEP, REFERENCE, ".json"))
-    return deep, reference, about
+def example_files(stem: Path, halves: bool = False) -> tuple[Path, ...]:
+    """The deep file, the reference, with `halves` its other half, and last the JSON of the example `stem` (a path
+    without extension)."""
+    ends = (DEEP, REFERENCE, *(OTHER_HALF,) * halves, ".json")
+    return tuple(stem.with_name(stem.name + end) for end in ends)
 
 
 def write_example(stem: Path, shot: Shot) -> None:
-    """Write the three files of an example. Raises OSError from the disk."""
-    deep, reference, about = example_files(stem)
-    size = shot.reference.shape[0]
+    """Write the files of an example. Raises OSError from the disk."""
+    references = [half for half in (shot.reference, shot.other_half) if half is not None]
+    deep, *targets, about = example_files(stem, len(references) > 1)
     with atomic_output(deep) as path:
-        write_deep(path, deep_samples(shot.channels, size))
-    with atomic_output(reference) as path:
-        write_flat(path, {name: np.ascontiguousarray(shot.reference[..., i]) for i, name in enumerate("RGBA")})
+        write_deep(path, deep_samples(shot.channels, shot.reference.shape[0]))
+    for target, half in zip(targets, references, strict=True):
+        with atomic_output(target) as path:
+            write_flat(path, {name: np.ascontiguousarray(half[..., i]) for i, name in enumerate("RGBA")})
     with atomic_output(about) as path:
         path.write_text(json.dumps(shot.about, indent=1) + "\n")

@@ -50,6 +50,7 @@ class RenderSettings:
     """How a scene is sampled.
 
     `samples` stored per pixel, `reference` paths per pixel of the target, `size` pixels square (a multiple of 4).
+    `halves` adds a second, independent target of as many paths, and changes nothing else.
     `layout` names one kind of scene; `defocus` and `motion` True or False force or forbid it, None leaves it to chance.
     """
 
@@ -59,15 +60,20 @@ class RenderSettings:
     layout: str | None = None
     defocus: bool | None = None
     motion: bool | None = None
+    halves: bool = False
 
 
 @dataclass(frozen=True)
 class Shot:
-    """`channels`: canonical name -> (N,), N = size^2 * samples, pixel-major; `reference` (size, size, 4) RGBA."""
+    """`channels`: canonical name -> (N,), N = size^2 * samples, pixel-major; `reference` (size, size, 4) RGBA.
+
+    `other_half` is a second reference, independent of the first.
+    """
 
     channels: dict[str, Array]
     reference: Array
     about: dict[str, Any]
+    other_half: Array | None = None
 
 
 def take_shot(load: Callable[[np.random.Generator], SceneTracer], seed: int, settings: RenderSettings) -> Shot:
@@ -152,17 +158,25 @@ def _expose(tracer: SceneTracer, view: View, black: bool, rng: np.random.Generat
     brightness = float(np.exp2(rng.normal(0, BRIGHTNESS_STOPS)))
     limit = float(np.exp(rng.uniform(*np.log(CLAMP))))
     scale_and_cut(channels, scale, limit, brightness)
-    total = np.zeros((size, size, 4))
-    for part in passes:
-        broken += _clean(part, black)
-        scale_and_cut(part, scale, limit, brightness)
-        total += np.stack([part[c].reshape(size, size, -1).sum(2, dtype=np.float64) for c in "RGBA"], -1)
-    reference = (total / settings.reference).astype(np.float32)
+
+    def mean(passes: Iterator[dict[str, Array]]) -> Array:
+        nonlocal broken
+        total = np.zeros((size, size, 4))
+        for part in passes:
+            broken += _clean(part, black)
+            scale_and_cut(part, scale, limit, brightness)
+            total += np.stack([part[c].reshape(size, size, -1).sum(2, dtype=np.float64) for c in "RGBA"], -1)
+        return (total / settings.reference).astype(np.float32)
+
+    reference, other = mean(passes), None
+    if settings.halves:
+        seed = int(rng.integers(2**31))
+        other = mean(_reference_passes(tracer, view, stratified, bins, rng, settings, seed))
     about = tracer.describe() | {
         "settings": asdict(settings), "defocus": view.defocus, "camera_motion": view.camera_motion,
         "object_motion": view.object_motion, "stratified": stratified, "time_bins": bins, "black_background": black,
-        "brightness": brightness, "clamp": limit, "non_finite_paths": broken, **_measure(channels, reference, n)}
-    return Shot(channels, reference, about)
+        "brightness": brightness, "clamp": limit, "non_finite_paths": broken, **_measure(channels, reference, other, n)}
+    return Shot(channels, reference, about, other)
 
 
 def scale_and_cut(channels: dict[str, Array], scale: float, limit: float, brightness: float) -> None:
@@ -206,11 +220,19 @@ def _trace(tracer: SceneTracer, view: View, stratified: bool, bins: int | None, 
         tables = {name: values.reshape(pixels, -1) for name, values in both.items()}
         return ({name: table[:, :n].ravel() for name, table in tables.items()},
                 iter([{name: tables[name][:, n:].ravel() for name in ("R", "G", "B", "A", *EMISSION)}]))
-    count = max(1, round(reference / (JOINT_REFERENCE if tracer.moving else REFERENCE_PASS)))
-    shares = [reference // count + (k < reference % count) for k in range(count)]
-    passes = (tracer.trace(view.camera, make_pattern(rng, pixels, share, stratified, bins), seeds[1] + k, stratified,
-                           "coverage") for k, share in enumerate(shares))
+    passes = _reference_passes(tracer, view, stratified, bins, rng, settings, seeds[1])
     return tracer.trace(view.camera, pattern, seeds[0], stratified), passes
+
+
+def _reference_passes(tracer: SceneTracer, view: View, stratified: bool, bins: int | None, rng: np.random.Generator,
+                      settings: RenderSettings, seed: int) -> Iterator[dict[str, Array]]:
+    """A reference's channels, as `_trace` has them, in passes that fit in memory."""
+    reference = settings.reference
+    count = max(1, round(reference / (JOINT_REFERENCE if tracer.moving else REFERENCE_PASS)))
+    for k in range(count):
+        share = reference // count + (k < reference % count)
+        pattern = make_pattern(rng, settings.size**2, share, stratified, bins)
+        yield tracer.trace(view.camera, pattern, seed + k, stratified, "coverage")
 
 
 def _exposure(image: Array) -> float:
@@ -237,15 +259,19 @@ def _clean(channels: dict[str, Array], black: bool) -> int:
     return int(bad.sum())
 
 
-def _measure(channels: dict[str, Array], reference: Array, samples: int) -> dict[str, float]:
+def _measure(channels: dict[str, Array], reference: Array, other: Array | None, samples: int) -> dict[str, float]:
     """How hard the example is: errors of its first eight samples, and how far it is blurred."""
     radiance, target = _stack(channels, samples), reference[..., :3]
+    half = None if other is None else other[..., :3]
+    mean = target if half is None else (target + half) / 2
     about = {"coverage": float((channels["A"] > 0).mean()), "coc_95": _percentile_95(channels, np.abs(channels["coc"])),
              "motion_95": _percentile_95(channels, np.hypot(channels["motion.X"], channels["motion.Y"])),
-             "energy": float(radiance.mean() / max(float(target.mean()), 1e-12))}
+             "energy": float(radiance.mean() / max(float(mean.mean()), 1e-12))}
     if float(np.percentile(target, 99)) > 0:
-        noisy = score(radiance[:, :8].mean(1).reshape(target.shape), target, with_flip=False)
+        noisy = score(radiance[:, :8].mean(1).reshape(target.shape), target, half, with_flip=False)
         about |= {"relmse8": noisy.relmse, "relmse8_trimmed": noisy.relmse_trimmed, "smape8": noisy.smape}
+        if noisy.floor is not None:
+            about["reference_floor"] = noisy.floor
     return about
 
 

@@ -21,7 +21,7 @@ from deep_io.flat import read_flat
 from deep_io.path_samples import PathSamples, SampleReader
 from deep_io.samples import Window
 from model.metrics import common_scale
-from pipelines.scene_names import DEEP, REFERENCE, reference_of, scene_name
+from pipelines.scene_names import DEEP, REFERENCE, other_half_of, reference_of, scene_name
 from pipelines.survey import survey
 from pipelines.training.cache import (
     CACHE_VERSION,
@@ -48,11 +48,11 @@ class SceneFiles:
 
     name: str
     deep: Path
-    reference: Path
+    references: tuple[Path, ...]  # one, or two independent halves
 
     def stamp(self) -> tuple[int, ...]:
         """Sizes and times of the files: they change when a scene is rendered again."""
-        stats = [path.stat() for path in (self.deep, self.reference)]
+        stats = [path.stat() for path in (self.deep, *self.references)]
         return tuple(number for stat in stats for number in (stat.st_size, stat.st_mtime_ns))
 
 
@@ -65,7 +65,8 @@ def scene_files(folder: Path, fewest: int = 1) -> list[SceneFiles]:
         reference = reference_of(deep)
         if not reference.exists():
             raise InputError(f"{deep}: its reference {reference.name} is missing; render it or move the deep file away")
-        files.append(SceneFiles(scene_name(deep), deep, reference))
+        other = other_half_of(deep)
+        files.append(SceneFiles(scene_name(deep), deep, (reference, other) if other.exists() else (reference,)))
     if not files:
         raise InputError(f"{folder}: no *{DEEP} files with *{REFERENCE} references in it")
     if len(files) < fewest:
@@ -113,7 +114,8 @@ def cache_scene(files: SceneFiles, folder: Path, threads: int | None = None) -> 
         if min(height, width) < SMALLEST_CROP:
             raise InputError(f"{files.deep}: {width}x{height} pixels; training needs {SMALLEST_CROP}x{SMALLEST_CROP} "
                              f"or more")
-        target = read_reference(files.reference, window, files.deep.name)
+        halves = [read_reference(path, window, files.deep.name) for path in files.references]
+        target = np.stack(halves).mean(0, np.float64).astype(np.float32)
         counts: list[npt.NDArray[np.int32]] = []
         seen = survey(_noting(reader.blocks(), counts))
         offsets = offsets_of(np.concatenate([block.ravel() for block in counts]))
@@ -124,7 +126,7 @@ def cache_scene(files: SceneFiles, folder: Path, threads: int | None = None) -> 
         uniform = not over and held.min() == held.max()
         exposed = target * np.float32(seen.exposure)
         if not np.isfinite(exposed).all():
-            raise InputError(f"{files.reference}: values too large for its deep file; render it again")
+            raise InputError(f"{files.references[0]}: values too large for its deep file; render it again")
 
         def write(kind: str, shape: tuple[int, ...], dtype: Any) -> npt.NDArray[Any]:
             path = outputs.enter_context(atomic_output(array_path(folder, files.name, kind)))

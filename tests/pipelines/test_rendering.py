@@ -14,6 +14,7 @@ import pytest
 from deep_io import read_deep
 from deep_io.errors import InputError, UsageError
 from deep_io.flat import HALF_MAX, read_flat
+from model.metrics import common_scale, reference_floor
 from pipelines.rendering import environment
 from pipelines.rendering import geometry as g
 from pipelines.rendering.camera import Camera
@@ -301,6 +302,36 @@ def test_other_settings_do_not_mix_with_what_is_there(tmp_path: Path) -> None:
     about.write_text("[]")
     with pytest.raises(InputError, match="scene000010.json: is not an example's JSON; delete it"):
         render_scenes(of_scene, "none")
+
+
+def test_a_reference_in_halves_is_two_of_one_expectation_and_changes_nothing_else(tmp_path: Path) -> None:
+    settings = RenderSettings(samples=4, reference=64, size=SIZE, layout="outdoor")
+    plain = options(tmp_path, count=1, settings=settings, contact_sheet=False)
+    render_scenes(plain, "none")
+    files = {path: path.read_bytes() for path in tmp_path.glob("*.exr")}
+    in_halves = replace(plain, settings=replace(settings, halves=True))
+    assert len(render_scenes(in_halves, "none").frames) == 1, "the other half is still to be rendered"
+    assert {path: path.read_bytes() for path in files} == files
+    assert render_scenes(in_halves, "none").frames == render_scenes(plain, "none").frames == ()
+    one, other = (np.stack([read_flat(tmp_path / f"scene000010{end}").channels[c] for c in "RGB"], -1)
+                  for end in (".ref.exr", ".ref2.exr"))
+    assert not np.array_equal(one, other)
+    assert other.mean() == pytest.approx(one.mean(), rel=0.05)
+    about = json.loads((tmp_path / "scene000010.json").read_text())
+    floor = reference_floor(*(common_scale((one.astype(float) + other) / 2) * half.astype(float)
+                              for half in (one, other)))
+    assert about["reference_floor"] == pytest.approx(floor, rel=1e-3)
+    assert 0 < floor < about["relmse8"]
+
+
+def test_moving_objects_have_references_in_halves_too() -> None:
+    settings = RenderSettings(4, 4, SIZE, "tabletop", motion=True)
+    plain, halved = (render_example(4, replace(settings, halves=halves), threads=1) for halves in (False, True))
+    assert plain.other_half is None
+    assert halved.other_half is not None
+    np.testing.assert_array_equal(plain.reference, halved.reference)
+    assert not np.array_equal(halved.other_half, halved.reference)
+    assert halved.other_half.mean() == pytest.approx(halved.reference.mean(), rel=0.3)
 
 
 def test_another_scene_of_the_same_file_name_does_not_mix_with_what_is_there(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from deep_io.errors import InputError
-from deep_io.flat import write_flat
+from deep_io.flat import read_flat, write_flat
 from deep_io.header import Header
 from deep_io.path_samples import PathSamples, SampleReader
 from deep_io.samples import Window
@@ -109,6 +109,19 @@ def test_a_cached_scene_is_decoded_again_only_when_it_changed(scenes: Path, tmp_
     assert [entry.name for entry in after.entries] == ["scene0", "scene1", "scene2", "scene9"]
     assert not np.array_equal(after.arrays(after.entries[1]).samples, held)
     np.testing.assert_array_equal(mapped, held)  # a training that runs on the old arrays goes on undisturbed
+
+
+def test_the_target_of_a_reference_in_halves_is_their_mean(scenes: Path, tmp_path: Path) -> None:
+    copied = tmp_path / "data"
+    shutil.copytree(scenes, copied)
+    before = build_cache(copied, tmp_path / "cache")
+    target = np.array(before.arrays(before.entries[1]).target)
+    one = read_flat(copied / "scene1.ref.exr").channels
+    write_flat(copied / "scene1.ref2.exr", {name: np.ascontiguousarray(3 * values) for name, values in one.items()})
+    told: list[str] = []
+    after = build_cache(copied, tmp_path / "cache", told.append)
+    assert told == ["cached scene1 (1 of 1)"], "a half that came later counts"
+    np.testing.assert_allclose(after.arrays(after.entries[1]).target, 2 * target, rtol=1e-6)
 
 
 def test_a_scene_whose_arrays_were_removed_is_decoded_again(scenes: Path, tmp_path: Path) -> None:
