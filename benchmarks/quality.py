@@ -18,7 +18,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
@@ -28,12 +27,12 @@ from deep_io.path_samples import PathSamples, SampleReader
 from model.baseline import clamp_and_blur, pixel_means
 from model.metrics import Scores, geometric_mean
 from pipelines.bench.results import spread
-from pipelines.bench.scenes import open_scene
+from pipelines.bench.scenes import find_scenes
 from pipelines.flat_pictures import read_rgb
 from pipelines.oidn import Oidn
 from pipelines.options import DenoiseOptions
 from pipelines.pictures import panel
-from pipelines.scene_names import DEEP, reference_of, scene_name
+from pipelines.scene_names import scene_name
 
 Picture = np.ndarray
 """(H, W, 3) linear RGB."""
@@ -100,15 +99,6 @@ def lbmc_method(model: str, threads: int | None, adapt: bool, layers: int | None
     return denoise
 
 
-def find_scenes(folder: Path, match: str) -> list[Path]:
-    """Deep sample files of a folder that have a reference. Ends the program when there are none."""
-    paths = [path for path in sorted(folder.glob(f"*{DEEP}")) if fnmatch(path.name, match)]
-    paths = [path for path in paths if reference_of(path).exists()]
-    if not paths:
-        sys.exit(f"ERROR: {folder}: no NAME.deep.exr with a NAME.ref.exr beside it matches {match!r}")
-    return paths
-
-
 def cells(scores: Scores) -> str:
     return f"{scores.relmse:.4f} / {scores.smape:.4f} / {scores.psnr:.2f} / {scores.energy:.3f}"
 
@@ -136,7 +126,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--model", action="append", default=[], help="preset or .safetensors file; repeatable")
-    parser.add_argument("--match", default="*", help="only files whose name matches this glob")
+    parser.add_argument("--match", default="*", help="only scenes whose NAME matches this glob")
     parser.add_argument("--no-oidn", action="store_true")
     parser.add_argument("--no-adapt", action="store_true")
     parser.add_argument("--layers", type=int)
@@ -160,10 +150,9 @@ def main() -> None:
             )
         results: dict[int, dict[str, dict[str, Scores]]] = {}
         seconds = dict.fromkeys(methods, 0.0)
-        for path in find_scenes(options.folder, options.match):
-            with SampleReader(path, threads=options.threads) as reader:
-                scene = Scene(path, reader.read())
-            truth = open_scene(path, reference_of(path))
+        for truth in find_scenes(options.folder, options.match):
+            with SampleReader(truth.source, threads=options.threads) as reader:
+                scene = Scene(truth.source, reader.read())
             pictures: dict[str, Picture] = {}
             for name, method in methods.items():
                 started = time.process_time()

@@ -168,7 +168,9 @@ def _is_complete(options: RenderOptions, seed: int, digest: str | None) -> bool:
     if rendered_of != digest:
         raise UsageError(f"{about_path}: was rendered of {options.scene} before that changed, or of another file of "
                          f"its name; choose another folder or other seeds")
-    return all(path.exists() for path in example_files(stem, options.settings.halves))
+    # The JSON comes last: it knows of a half that is there whole.
+    halves = about["settings"].get("halves", False) and all(path.exists() for path in example_files(stem, True))
+    return halves or not options.settings.halves
 
 
 def _but_halves(settings: dict[str, Any]) -> dict[str, Any]:

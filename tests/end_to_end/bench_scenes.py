@@ -9,6 +9,7 @@ import numpy as np
 from deep_io import DeepSamples, Header, Window
 from deep_io.flat import write_flat
 from model.baseline import blur, pixel_means
+from pipelines.flat_pictures import read_rgb
 from tests.end_to_end.scenes import changed, noisy_scene, write_scene
 
 WINDOW = Window(0, 0, 31, 23)
@@ -40,3 +41,12 @@ def full(scene: DeepSamples, samples: int, seed: int) -> DeepSamples:
                         {name: values[pick] for name, values in scene.channels.items()}, scene.window)
     noise = rng.lognormal(-0.2, 0.6, drawn.total)
     return changed(drawn, **{name: (drawn.channels[name] * noise).astype(np.float16) for name in "RGB"})
+
+
+def write_halves(folder: Path, name: str, seed: int) -> None:
+    """A scene whose reference is two halves: the smooth picture of `write_pair` with noise of its own each."""
+    write_pair(folder, name, seed)
+    truth = read_rgb(folder / f"{name}.ref.exr").rgb
+    rng = np.random.default_rng(seed)
+    for kind in ("ref", "ref2"):
+        write_reference(folder / f"{name}.{kind}.exr", truth * rng.gamma(16.0, 1.0 / 16.0, truth.shape))

@@ -16,21 +16,12 @@ from deep_io import Window
 from pipelines.bench.results import Results
 from pipelines.bench.scenes import find_scenes
 from pipelines.flat_pictures import read_rgb
-from tests.end_to_end.bench_scenes import WINDOW, write_pair, write_reference
+from tests.end_to_end.bench_scenes import WINDOW, write_halves, write_pair, write_reference
 from tests.end_to_end.scenes import random_weights
 from tests.runner import in_process
 
 QUICK = ("--no-paper", "--no-memory", "--no-savings", "--no-curves", "--no-flip", "--repeats", 1, "--frame", 0,
          "--progress", "none")
-
-
-def write_halves(folder: Path, name: str, seed: int) -> None:
-    """A scene whose reference is two halves: the smooth picture of `write_pair` with noise of its own each."""
-    write_pair(folder, name, seed)
-    truth = read_rgb(folder / f"{name}.ref.exr").rgb
-    rng = np.random.default_rng(seed)
-    for kind in ("ref", "ref2"):
-        write_reference(folder / f"{name}.{kind}.exr", truth * rng.gamma(16.0, 1.0 / 16.0, truth.shape))
 
 
 @pytest.fixture(scope="module")

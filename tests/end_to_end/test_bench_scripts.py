@@ -19,9 +19,12 @@ from PIL import Image
 from deep_io import Window
 from deep_io.errors import InputError
 from deep_io.path_samples import SampleReader
+from model.baseline import pixel_means
+from model.metrics import score
 from pipelines.bench.methods import MethodSpec
 from pipelines.bench.results import CurvePoint, GrowthPoint, Measurement, Results, SceneInfo
-from tests.end_to_end.bench_scenes import WINDOW, write_pair
+from pipelines.flat_pictures import read_rgb
+from tests.end_to_end.bench_scenes import WINDOW, write_halves, write_pair
 from tests.end_to_end.scenes import changed, noisy_scene, random_weights, write_scene
 
 HOME = Path(__file__).resolve().parents[2]
@@ -43,6 +46,23 @@ def run(path: str, *words: object) -> str:
                           env=environment)
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def test_quality_measures_against_the_mean_of_both_halves(tmp_path: Path) -> None:
+    folder, result = tmp_path / "scenes", tmp_path / "quality.json"
+    folder.mkdir()
+    write_halves(folder, "first", 1)
+    write_pair(folder, "whole", 2)
+    run("benchmarks/quality.py", folder, "--no-oidn", "--json", result)
+    found = json.loads(result.read_text("utf-8"))
+    one, other = (read_rgb(folder / f"first.{kind}.exr").rgb for kind in ("ref", "ref2"))
+    with SampleReader(folder / "first.deep.exr") as reader:
+        samples = reader.read()
+    noisy = pixel_means(samples.counts, samples.weight, samples.roles["radiance"])
+    expected = score(noisy, one, other, with_flip=False)
+    for name in ("relmse", "relmse_unbiased", "floor", "smape"):
+        assert found["first"]["noisy"][name] == pytest.approx(getattr(expected, name), rel=1e-6), name
+    assert found["whole"]["noisy"]["floor"] is None
 
 
 def test_the_papers_networks_are_trained_scored_and_kept(tmp_path: Path) -> None:

@@ -322,6 +322,10 @@ def test_a_reference_in_halves_is_two_of_one_expectation_and_changes_nothing_els
                               for half in (one, other)))
     assert about["reference_floor"] == pytest.approx(floor, rel=1e-3)
     assert 0 < floor < about["relmse8"]
+    # One whose JSON does not know of its half was stopped in between.
+    about["settings"]["halves"] = False
+    (tmp_path / "scene000010.json").write_text(json.dumps(about))
+    assert len(render_scenes(in_halves, "none").frames) == 1
 
 
 def test_moving_objects_have_references_in_halves_too() -> None:
