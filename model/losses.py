@@ -20,6 +20,9 @@ from torch import Tensor
 EPSILON = 0.01  # of both SMAPE and relative error, the metrics' own
 OUTLIER = 100.0  # relative squared errors saturate here: one firefly in a target must not own a step
 BEYOND = 4.0  # times a target that a prediction is measured by its own size; above that noise is no excuse
+LEAK_CUT = 30.0  # the same relative to the reference, where a lamp that leaks into the dark would own a step
+SMALLER = 0.25  # times a prediction that a reference counts as at least: leaks are errors, not infinite ones
+SMOOTHING_WINDOW, SMOOTHING_SPREAD = 5, 0.4  # pixels, log units: what of a noisy reference is one surface
 LOG_FLOOR = 1e-3  # added to a crop's relative error before its logarithm
 SRGB_LINEAR, SRGB_SLOPE, SRGB_SCALE, SRGB_OFFSET, SRGB_POWER = 0.0031308, 12.92, 1.055, 0.055, 2.4
 
@@ -33,6 +36,10 @@ class LossWeights:
         float, "log of a crop's squared error relative to the prediction, or to 4 times the reference where that is "
                "less, outliers cut: a hard crop counts no more than an easy one"
     ] = 0.2
+    leaks: Annotated[
+        float, "log of a crop's squared error relative to the reference, smoothed between edges, outliers cut: what is "
+               "too bright in the dark counts as the metric counts it"
+    ] = 0.0
     noise2noise: Annotated[
         float, "squared error relative to the prediction, (d - y)^2 / (d^2 + 0.01), uncut: safe for noisy references"
     ] = 0.0
@@ -71,6 +78,34 @@ def log_relative(prediction: Tensor, target: Tensor) -> Tensor:
     return torch.log(error.mean((1, 2, 3)) + LOG_FLOOR).mean()
 
 
+def leaks(prediction: Tensor, target: Tensor) -> Tensor:
+    """Mean over crops of log(mean((d - y)^2 / (m^2 + 0.01)) + 1e-3), m = max(|smooth(y)|, |d| / 4), outliers saturated.
+
+    The reference's own noise must not divide: what is dark by chance would count most, and the minimum be too dark.
+    """
+    scale = torch.maximum(smoothed(target), SMALLER * prediction.detach().abs())
+    error = (prediction - target).square() / (scale.square() + EPSILON)
+    error = error / (1 + error.detach() / LEAK_CUT)
+    return torch.log(error.mean((1, 2, 3)) + LOG_FLOOR).mean()
+
+
+def smoothed(picture: Tensor) -> Tensor:
+    """(B, 3, H, W): the bilateral mean of |picture| over SMOOTHING_WINDOW pixels, edges as log luminance has them."""
+    radius = SMOOTHING_WINDOW // 2
+    height, width = picture.shape[-2:]
+    picture = picture.abs()
+    brightness = torch.log(picture + EPSILON).mean(1, keepdim=True)
+    padded = F.pad(torch.cat([picture, brightness], 1), (radius,) * 4, mode="replicate")
+    sums, weights = torch.zeros_like(picture), torch.zeros_like(brightness)
+    for dy in range(SMOOTHING_WINDOW):
+        for dx in range(SMOOTHING_WINDOW):
+            near = padded[..., dy : dy + height, dx : dx + width]
+            weight = torch.exp(-0.5 * ((near[:, 3:] - brightness) / SMOOTHING_SPREAD).square())
+            sums += weight * near[:, :3]
+            weights += weight
+    return sums / weights
+
+
 def tone_map(picture: Tensor) -> Tensor:
     """sRGB transfer function of log(1 + max(x, 0)), not clamped above."""
     y = torch.log1p(picture.clamp_min(0))
@@ -92,6 +127,8 @@ def total_loss(prediction: Tensor, target: Tensor, weights: LossWeights) -> Tens
             loss = loss + weight * term(prediction, target)
     if weights.relative:
         loss = loss + weights.relative * log_relative(prediction, target)
+    if weights.leaks:
+        loss = loss + weights.leaks * leaks(prediction, target)
     for size, weight in weights.pooled:
         size = min(size, *prediction.shape[-2:])
         loss = loss + weight * smape(F.avg_pool2d(prediction, size), F.avg_pool2d(target, size))

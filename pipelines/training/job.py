@@ -14,12 +14,14 @@ from torch import Tensor
 from deep_io.errors import InputError, UsageError
 from model import zoo
 from model.config import CONFIGS, FAST, Config
+from model.denoiser import Denoiser
 from pipelines.training.batches import crop_size
 from pipelines.training.cache import CACHE_VERSION, SampleCache
 from pipelines.training.caching import build_cache, scene_files
 from pipelines.training.drawing import can_draw
 from pipelines.training.group import Group, joined
 from pipelines.training.loop import Trainer
+from pipelines.training.optimizer import hold_all_but
 from pipelines.training.recipe import Recipe, differences
 from pipelines.training.run_folder import RunFolder, read_checkpoint
 
@@ -115,6 +117,9 @@ def _prepare(options: TrainOptions, group: Group, report: Callable[[str], None])
                          f"nothing about others, so name a folder of other scenes")
     if options.start is not None:
         starting_weights(options.start, config)
+    if options.recipe.only is not None:
+        with torch.device("meta"):
+            hold_all_but(Denoiser(config), options.recipe.only)
     folder = RunFolder(options.out, config, options.recipe)
     folder.read(torch.device("cpu"))
     folder.require_room()

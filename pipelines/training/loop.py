@@ -25,7 +25,7 @@ from pipelines.signals import StoppedError, signals_noted
 from pipelines.training.batches import Batch, random_batch
 from pipelines.training.cache import SampleCache
 from pipelines.training.group import ALONE, Group
-from pipelines.training.optimizer import make_optimizer
+from pipelines.training.optimizer import hold_all_but, make_optimizer
 from pipelines.training.recipe import Recipe
 from pipelines.training.run_folder import RunFolder, State
 from pipelines.training.validation import UNIT, validate
@@ -78,7 +78,7 @@ class Objective(nn.Module):
         if self.recipe.depth_order and wanted > 1 and "depth" in batch.samples.roles:
             loss = loss + self.recipe.depth_order * disorder(layers)
         # processes must agree on which parameters have a gradient: all have one, if only 0
-        return loss + 0 * torch.stack([p.sum() for p in self.net.parameters()]).sum()
+        return loss + 0 * torch.stack([p.sum() for p in self.net.parameters() if p.requires_grad]).sum()
 
 
 class Trainer:
@@ -95,6 +95,8 @@ class Trainer:
         torch.manual_seed(recipe.seed)
         self.recipe, self.group, self.folder = recipe, group, RunFolder(folder, config, recipe)
         self.net = Denoiser(config).set_product_dtype(torch.bfloat16 if recipe.bfloat16 else None)
+        if recipe.only is not None:
+            hold_all_but(self.net, recipe.only)
         if start is not None:
             self.net.load_state_dict(start)
         self.averaged = Denoiser(config)

@@ -1,4 +1,4 @@
-"""The optimizer of a run: Adam, or Muon for matrices with Adam for the rest.
+"""What a run trains of a network, and by which optimizer: Adam, or Muon for matrices with Adam for the rest.
 
 Muon (Jordan et al. 2024) steps by the momentum with all its singular values made alike, so that directions that the
 gradient hardly shows are learned, too. It is made for hidden layers: what comes in and goes out is stepped by Adam.
@@ -6,6 +6,7 @@ gradient hardly shows are learned, too. It is made for hidden layers: what comes
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -25,7 +26,8 @@ class Optimizer:
     """One or two of PyTorch's optimizers as one: every parameter of a network belongs to one of them."""
 
     def __init__(self, net: Denoiser, recipe: Recipe) -> None:
-        matrices, others = _split(net) if recipe.muon else ([], list(net.parameters()))
+        trained = [parameter for parameter in net.parameters() if parameter.requires_grad]
+        matrices, others = _split(net, trained) if recipe.muon else ([], trained)
         self._matrices = [(weight, nn.Parameter(weight.detach().view(len(weight), -1))) for weight in matrices]
         self._parts: list[torch.optim.Optimizer] = [torch.optim.Adam(others, lr=recipe.learning_rate, betas=BETAS)]
         if matrices:
@@ -64,6 +66,16 @@ class Optimizer:
             part.load_state_dict(saved)
 
 
+def hold_all_but(net: Denoiser, part: str) -> None:
+    """Only the parameters of one part of the network, such as `generator`, are trained. Raises UsageError where there
+    is none of that name."""
+    parts = [name for name, module in net.named_children() if next(module.parameters(), None) is not None]
+    if part not in parts:
+        raise UsageError(f"the recipe's only: {net.config.name} has no part {part!r}; there are {', '.join(parts)}")
+    for name, parameter in net.named_parameters():
+        parameter.requires_grad_(name.startswith(f"{part}."))
+
+
 def make_optimizer(net: Denoiser, recipe: Recipe) -> Optimizer:
     """The optimizer that a recipe asks for. Raises UsageError where this PyTorch has none such."""
     if recipe.muon and not hasattr(torch.optim, "Muon"):
@@ -72,12 +84,12 @@ def make_optimizer(net: Denoiser, recipe: Recipe) -> Optimizer:
     return Optimizer(net, recipe)
 
 
-def _split(net: Denoiser) -> tuple[list[Tensor], list[Tensor]]:
+def _split(net: Denoiser, trained: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
     """Hidden matrices and convolutions, and everything else."""
     last = {id(mlp.layers[-1].weight) for mlp in net.modules() if isinstance(mlp, Mlp)}
     matrices: list[Tensor] = []
     others: list[Tensor] = []
-    for parameter in net.parameters():
+    for parameter in trained:
         wide = parameter.dim() in (2, 4) and min(len(parameter), parameter[0].numel()) >= NARROWEST
         (matrices if wide and id(parameter) not in last else others).append(parameter)
     return matrices, others

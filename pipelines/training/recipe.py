@@ -45,6 +45,10 @@ class Recipe:
     """One training run."""
 
     steps: Annotated[int, "length of the run"] = 4000
+    only: Annotated[
+        str | None, "the one part of the network that is trained, such as generator, while all others stay as they "
+                    "start; null: all are trained"
+    ] = None
     batch: Annotated[int, "crops a step, of all processes together"] = 4
     crop: Annotated[int, "pixels along a crop's side; smaller where a scene is smaller"] = 128
     learning_rate: Annotated[float, "of Adam, at its highest; Muon's steps are scaled to the size of Adam's"] = 1e-3

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from model.losses import LossWeights, smape, tone_mapped, total_loss
+from model.losses import LossWeights, smape, smoothed, tone_mapped, total_loss
 
 
 def picture(value: float) -> torch.Tensor:
@@ -72,7 +72,7 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_crops_losses() -> None:
     assert float(total_loss(prediction, target, weights)) == pytest.approx(sum(parts) / 3, rel=1e-5)
 
 
-@pytest.mark.parametrize("term", ["smape", "relative", "noise2noise", "tone_mapped"])
+@pytest.mark.parametrize("term", ["smape", "relative", "leaks", "noise2noise", "tone_mapped"])
 def test_a_black_prediction_has_a_finite_gradient(term: str) -> None:
     weights = replace(LossWeights(smape=0.0, relative=0.0, pooled=()), **{term: 1.0})
     prediction = torch.zeros((1, 3, 4, 4), requires_grad=True)
@@ -95,3 +95,31 @@ def test_a_pooled_cell_larger_than_the_picture_is_the_picture() -> None:
     weights = LossWeights(smape=0.0, relative=0.0, pooled=((64, 1.0),))
     blocks = [picture[..., :12, :12].mean((2, 3)) for picture in (prediction, target)]  # square cells, the rest is cut
     assert float(total_loss(prediction, target, weights)) == pytest.approx(float(smape(*blocks)), rel=1e-4)
+
+
+def test_a_leak_counts_by_the_dark_it_is_in_and_by_its_own_size_at_most() -> None:
+    leaks = LossWeights(smape=0.0, leaks=1.0, relative=0.0, pooled=())
+
+    def expected(prediction: float, divisor: float) -> float:
+        error = (prediction - 0.5) ** 2 / (divisor**2 + 0.01)
+        return math.log(error / (1 + error / 30) + 1e-3)
+
+    assert float(total_loss(picture(1.0), picture(0.5), leaks)) == pytest.approx(expected(1.0, 0.5), rel=1e-5)
+    assert float(total_loss(picture(20.0), picture(0.5), leaks)) == pytest.approx(expected(20.0, 5.0), rel=1e-5)
+
+
+def test_the_noise_of_a_reference_hardly_moves_the_minimum_of_leaks() -> None:
+    """Divided by the noisy reference itself, the minimum would be E[1 / y] / E[1 / y^2], 8 % below the mean."""
+    draw = torch.Generator().manual_seed(5)
+    targets = 1 + 0.2 * torch.randn((4, 3, 32, 32), generator=draw)
+    leaks = LossWeights(smape=0.0, leaks=1.0, relative=0.0, pooled=())
+    assert minimum(leaks, targets) == pytest.approx(1.0, abs=0.02)
+
+
+def test_smoothing_takes_noise_and_leaves_edges() -> None:
+    draw = torch.Generator().manual_seed(6)
+    clean = torch.full((1, 3, 32, 32), 0.2)
+    clean[..., 16:] = 20.0
+    noisy = clean * (1 + 0.2 * torch.randn(clean.shape, generator=draw))
+    error = (smoothed(noisy) / clean - 1).square().mean((0, 1, 2)).sqrt()  # (32,) by distance from the edge
+    assert float(error.max()) < 0.12

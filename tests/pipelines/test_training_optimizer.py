@@ -1,4 +1,4 @@
-"""The optimizers: every parameter moves, Muon's steps are of the size of Adam's, and a run with it resumes."""
+"""What is trained and how: every parameter moves, Muon steps as far as Adam, and a run with it resumes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import torch
 from deep_io.errors import UsageError
 from model.config import FAST
 from model.denoiser import Denoiser
+from pipelines.training.batches import random_batch
+from pipelines.training.cache import SampleCache
 from pipelines.training.caching import build_cache
 from pipelines.training.loop import Trainer
 from pipelines.training.optimizer import make_optimizer
@@ -18,6 +20,14 @@ from tests.pipelines.training_data import QUICK, SMALL, write_example
 
 MUON = dataclasses.replace(QUICK, muon=True)
 RATE = 1e-3
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> SampleCache:
+    data = tmp_path_factory.mktemp("data")
+    for number in range(2):
+        write_example(data, f"scene{number}", number)
+    return build_cache(data, tmp_path_factory.mktemp("cache"))
 
 
 def test_every_parameter_is_stepped_and_hidden_matrices_in_all_directions_alike() -> None:
@@ -39,12 +49,7 @@ def test_every_parameter_is_stepped_and_hidden_matrices_in_all_directions_alike(
     assert all(p.grad is None for p in net.parameters())
 
 
-def test_a_run_with_muon_resumes_to_the_uninterrupted_one(tmp_path: Path) -> None:
-    data = tmp_path / "data"
-    data.mkdir()
-    for number in range(2):
-        write_example(data, f"scene{number}", number)
-    cache = build_cache(data, tmp_path / "cache")
+def test_a_run_with_muon_resumes_to_the_uninterrupted_one(tmp_path: Path, cache: SampleCache) -> None:
     whole = Trainer(SMALL, MUON, tmp_path / "whole")
     whole.run(cache, cache, lambda _: None)
     Trainer(SMALL, MUON, tmp_path / "parts").run(cache, cache, lambda _: None, seconds=0)
@@ -67,3 +72,14 @@ def test_a_pytorch_without_muon_is_refused_in_one_line(monkeypatch: pytest.Monke
     with pytest.raises(UsageError, match=r"PyTorch 2\.9"):
         make_optimizer(Denoiser(SMALL), MUON)
     make_optimizer(Denoiser(SMALL), QUICK)
+
+
+@pytest.mark.parametrize("muon", [False, True])
+def test_only_the_part_that_is_asked_for_is_trained(tmp_path: Path, cache: SampleCache, muon: bool) -> None:
+    recipe = dataclasses.replace(QUICK, only="generator", muon=muon)
+    trainer = Trainer(SMALL, recipe, tmp_path)
+    before = {name: value.clone() for name, value in trainer.averaged.state_dict().items()}
+    for _ in range(2):
+        trainer.advance(random_batch(cache, recipe, trainer.step))
+    for name, value in trainer.averaged.state_dict().items():
+        assert torch.equal(value, before[name]) == (not name.startswith("generator.")), name
