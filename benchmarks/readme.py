@@ -3,7 +3,7 @@
 
     python benchmarks/readme.py [--out build/bench] [--threads 1]
     python benchmarks/readme.py --keep      also makes its results the repository's: results.json, charts and tables
-    python benchmarks/readme.py --keep --scenes val2=FOLDER --scenes shared=FOLDER [--work WORK]
+    python benchmarks/readme.py --keep --scenes watched=FOLDER --scenes shared=FOLDER [--work WORK]
         also all else in docs/results.md that changes with the weights: error by samples on scenes of 32, what the
         layers do, the pictures of layers (WORK is where benchmarks/paper.py left its networks)
 

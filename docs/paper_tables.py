@@ -1,7 +1,8 @@
 """The tables and counted sentences of docs/results.md on networks of reduced width, made from docs/results/paper.json.
 
 benchmarks/paper.py trains and scores the rows, benchmarks/paper_times.py times their networks. What a sentence says of
-numbers is counted here, so that other rows need no other text.
+numbers is counted here, so that other rows need no other text. `blurred` in the JSON names, for each set, the scenes
+with defocus or motion.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import product
 
 import numpy as np
-from result_tables import BLURRED, HOME, SETS, STILL, Row, blurred_scenes, load, markdown
+from result_tables import BLURRED, HOME, SETS, STILL, Row, load, markdown
 
 from model.metrics import geometric_mean
 from pipelines.bench.charts import number
@@ -38,6 +39,14 @@ def mean_errors(row: Row, name: str) -> list[float]:
     scenes = row["scenes"][name].values()
     return [*(geometric_mean([scene[key] for scene in scenes]) for key in ("relmse", "trimmed")),
             float(np.mean([scene["smape"] for scene in scenes]))]
+
+
+def blurred_scenes() -> dict[tuple[str, str], bool]:
+    """(set, scene) -> whether it has defocus or motion."""
+    document = load(PAPER)
+    some = next(iter(document["rows"].values()))
+    return {(name, scene): scene in document["blurred"][name]
+            for name, scenes in some["scenes"].items() for scene in scenes}
 
 
 def errors_of(row: Row) -> list[str]:

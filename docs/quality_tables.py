@@ -13,7 +13,7 @@ from result_tables import markdown
 from model.metrics import bootstrap_interval, geometric_mean
 
 RESULTS = Path(__file__).resolve().parent / "results"
-SETS = {"shared": "12 of another generator", "unseen": "20 of our own, unseen", "val2": "14 of our own, watched"}
+SETS = {"shared": "12 of another generator", "unseen": "20 of our own, unseen", "watched": "20 of our own, watched"}
 """docs/results/quality-NAME.json, and what the table calls it."""
 METHODS = {"noisy": "noisy", "baseline": "clamp and blur", "OIDN color": "OIDN colour",
            "OIDN aux": "OIDN + albedo, normal", "OIDN prefiltered": "OIDN prefiltered", "lbmc fast": "lbmc fast",

@@ -25,7 +25,8 @@ HOME = Path(__file__).resolve().parent.parent
 BENCH, SAMPLES = HOME / "results.json", HOME / "docs" / "results" / "samples.json"
 ALIVE, VISIBILITY = (HOME / "docs" / "results" / name for name in ("layers_alive.json", "visibility.json"))
 SETS = {"val2": "14 of our own", "shared": "12 further"}
-"""Sets of scenes in the JSON, and what the tables call them."""
+ALIVE_SETS = {"watched": "20 of our own", "shared": "12 further"}
+"""Sets of scenes in the JSON of networks of reduced width and in that of layers, and what the tables call them."""
 LEAST = 0.1
 """The front layer is to have this share of the weight at least, and at most one less it."""
 NETWORK_STAGES = {stage: words for stage, words in STAGES.items() if stage not in OUTSIDE}
@@ -175,12 +176,6 @@ def layer_cost() -> str:
 # --- the layers are alive ------------------------------------------------------------------------------------------
 
 
-def blurred_scenes() -> dict[tuple[str, str], bool]:
-    """(set, scene) -> whether it has defocus or motion."""
-    return {(name, scene): row["blurred"] for name, scenes in load(ALIVE)["sets"].items()
-            for scene, row in scenes.items()}
-
-
 def alive() -> str:
     """What the layers of the shipped network do where depth mixes within a pixel."""
 
@@ -191,10 +186,9 @@ def alive() -> str:
     for name, scenes in load(ALIVE)["sets"].items():
         for scene, row in sorted(scenes.items(), key=lambda item: not item[1]["blurred"]):
             if "filtered" in row:
-                found = row["filtered"]
-                lines.append([f"{scene} ({BLURRED if row['blurred'] else STILL})", SETS.get(name, name).split()[0],
-                              f"{row['mixed']:.0%}", f"{found['front']:.2f}", f"{found['both']:.0%}",
-                              nearer(row["samples"]), nearer(found)])
+                found, what = row["filtered"], BLURRED if row["blurred"] else STILL
+                lines.append([f"{scene} ({what})", ALIVE_SETS.get(name, name).split()[0], f"{row['mixed']:.0%}",
+                              f"{found['front']:.2f}", f"{found['both']:.0%}", nearer(row["samples"]), nearer(found)])
     return markdown(("scene", "set of", "depth mixes in", "front layer's weight there", "10 to 90 % in",
                      "front is nearer, samples", "front is nearer, filtered"), lines)
 
@@ -205,7 +199,7 @@ def alive_count() -> str:
     for (name, scenes), is_blurred in product(load(ALIVE)["sets"].items(), (True, False)):
         rows = [row["filtered"] for row in scenes.values() if row["blurred"] == is_blurred and "filtered" in row]
         if rows:
-            lines.append([f"{len(rows)} of {SETS.get(name, name)}, {BLURRED if is_blurred else STILL}",
+            lines.append([f"{len(rows)} of {ALIVE_SETS.get(name, name)}, {BLURRED if is_blurred else STILL}",
                           str(sum(LEAST <= row["front"] <= 1 - LEAST for row in rows)),
                           *(str(sum(row[key] >= 1 - LEAST for row in rows))
                             for key in ("nearer", "nearer_with_misses"))])

@@ -40,6 +40,10 @@ class LossWeights:
         float, "log of a crop's squared error relative to the reference, smoothed between edges, outliers cut: what is "
                "too bright in the dark counts as the metric counts it"
     ] = 0.0
+    darkness: Annotated[
+        float, "share of a crop's light that is lost, less what is won: linear, so that noise in a reference moves it "
+               "nowhere; against terms that would rather be too dark"
+    ] = 0.0
     noise2noise: Annotated[
         float, "squared error relative to the prediction, (d - y)^2 / (d^2 + 0.01), uncut: safe for noisy references"
     ] = 0.0
@@ -89,6 +93,14 @@ def leaks(prediction: Tensor, target: Tensor) -> Tensor:
     return torch.log(error.mean((1, 2, 3)) + LOG_FLOOR).mean()
 
 
+def darkness(prediction: Tensor, target: Tensor) -> Tensor:
+    """Mean over crops and colours of 1 - mean(d) / mean(y), between -1 and 1; 0 for a crop that should be black."""
+    light = target.mean((2, 3))
+    lit = light > EPSILON
+    lost = 1 - prediction.mean((2, 3)) / torch.where(lit, light, 1)
+    return (lost.clamp(-1, 1) * lit).mean()
+
+
 def smoothed(picture: Tensor) -> Tensor:
     """(B, 3, H, W): the bilateral mean of |picture| over SMOOTHING_WINDOW pixels, edges as log luminance has them."""
     radius = SMOOTHING_WINDOW // 2
@@ -121,14 +133,12 @@ def tone_mapped(prediction: Tensor, target: Tensor) -> Tensor:
 def total_loss(prediction: Tensor, target: Tensor, weights: LossWeights) -> Tensor:
     """The weighted sum, a scalar; prediction and target (B, 3, H, W) in the common scale."""
     loss = prediction.new_zeros(())
-    for term in (smape, noise2noise, tone_mapped):
+    for term in (smape, leaks, darkness, noise2noise, tone_mapped):
         weight = getattr(weights, term.__name__)
         if weight:
             loss = loss + weight * term(prediction, target)
     if weights.relative:
         loss = loss + weights.relative * log_relative(prediction, target)
-    if weights.leaks:
-        loss = loss + weights.leaks * leaks(prediction, target)
     for size, weight in weights.pooled:
         size = min(size, *prediction.shape[-2:])
         loss = loss + weight * smape(F.avg_pool2d(prediction, size), F.avg_pool2d(target, size))

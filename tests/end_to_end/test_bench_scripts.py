@@ -155,10 +155,10 @@ def test_sentences_about_the_papers_networks_are_counted_from_the_rows(
     tables = import_module("paper_tables")
     names = {"LAYER": 0.10, "PIXELGATHER": 0.12, "OPTIMIZED": 0.08, "LAYER, tone-mapped L2": 0.11}
     rows = {name: reduced_row(name, 3000, error) for name, error in names.items()}
-    document = {"scenes": ["one", "two"], "rows": rows, "untrained": {"clamp and blur": reduced_row("", 0, 0.11)}}
+    document = {"scenes": ["one", "two"], "blurred": {"val2": ["s"], "shared": ["t"]}, "rows": rows,
+                "untrained": {"clamp and blur": reduced_row("", 0, 0.11)}}
     (tmp_path / "paper.json").write_text(json.dumps(document), "utf-8")
     monkeypatch.setattr(tables, "PAPER", tmp_path / "paper.json")
-    monkeypatch.setattr(tables, "blurred_scenes", lambda: {("val2", "s"): True, ("shared", "t"): True})
     told = " ".join(tables.training().split())
     assert "3,000 steps of 2 crops of 64 x 64 pixels, 300 CPU seconds, on 2 procedural scenes" in told
     assert "of the 4 networks, 2 on 14 of our own and 2 on 12 further have a lower relMSE" in told

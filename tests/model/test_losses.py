@@ -123,3 +123,17 @@ def test_smoothing_takes_noise_and_leaves_edges() -> None:
     noisy = clean * (1 + 0.2 * torch.randn(clean.shape, generator=draw))
     error = (smoothed(noisy) / clean - 1).square().mean((0, 1, 2)).sqrt()  # (32,) by distance from the edge
     assert float(error.max()) < 0.12
+
+
+def test_darkness_is_the_share_of_light_that_is_lost_and_has_one_slope_everywhere() -> None:
+    weights = LossWeights(smape=0.0, darkness=1.0, relative=0.0, pooled=())
+    assert float(total_loss(picture(0.3), picture(0.4), weights)) == pytest.approx(0.25)
+    assert float(total_loss(picture(0.5), picture(0.4), weights)) == pytest.approx(-0.25)
+    assert float(total_loss(picture(0.5), picture(0.0), weights)) == 0.0
+    slopes = []
+    for value in (0.1, 0.7):
+        prediction = torch.full((1, 3, 4, 4), value, requires_grad=True)
+        total_loss(prediction, picture(0.5), weights).backward()
+        assert prediction.grad is not None
+        slopes.append(prediction.grad)
+    torch.testing.assert_close(slopes[0], slopes[1])
