@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from layers_alive import blurred
 
 from deep_io.atomic import atomic_output
 from deep_io.errors import InputError
@@ -30,7 +31,7 @@ from pipelines.bench.methods import BlurMethod, FlatMethod, LbmcMethod, Method, 
 from pipelines.bench.results import own
 from pipelines.bench.scenes import find_scenes, write_thinned
 from pipelines.flat_pictures import read_rgb
-from pipelines.scene_names import reference_of
+from pipelines.scene_names import DEEP, reference_of
 from pipelines.training.batches import random_batch
 from pipelines.training.cache import SampleCache, SceneArrays, SceneEntry
 from pipelines.training.job import open_cache
@@ -204,6 +205,9 @@ def perform(description: str, runs: Iterable[Run], rows: Path,
     if options.json.exists():
         document = json.loads(options.json.read_text("utf-8"))
     document["scenes"] = document["scenes"] or [entry.name for entry in cache.entries]
+    for name, scenes in sets.items():
+        document.setdefault("blurred", {})[name] = [
+            scene for scene, _, reference in scenes if blurred(reference.with_name(f"{scene}{DEEP}"))]
     for name in UNTRAINED:
         if name not in document.setdefault("untrained", {}):
             document["untrained"][name] = untrained(name, sets, options.work)

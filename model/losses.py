@@ -20,7 +20,7 @@ from torch import Tensor
 EPSILON = 0.01  # of both SMAPE and relative error, the metrics' own
 OUTLIER = 100.0  # relative squared errors saturate here: one firefly in a target must not own a step
 BEYOND = 4.0  # times a target that a prediction is measured by its own size; above that noise is no excuse
-LEAK_CUT = 30.0  # the same relative to the reference, where a lamp that leaks into the dark would own a step
+LEAK_CUT = 30.0  # the same of `leaks`, for fireflies in a reference: a leak stays below 1 / SMALLER^2
 SMALLER = 0.25  # times a prediction that a reference counts as at least: leaks are errors, not infinite ones
 SMOOTHING_WINDOW, SMOOTHING_SPREAD = 5, 0.4  # pixels, log units: what of a noisy reference is one surface
 LOG_FLOOR = 1e-3  # added to a crop's relative error before its logarithm
@@ -37,12 +37,12 @@ class LossWeights:
                "less, outliers cut: a hard crop counts no more than an easy one"
     ] = 0.2
     leaks: Annotated[
-        float, "log of a crop's squared error relative to the reference, smoothed between edges, outliers cut: what is "
-               "too bright in the dark counts as the metric counts it"
+        float, "log of a crop's squared error relative to the reference, smoothed between edges, or to a quarter of "
+               "the prediction where that is more, outliers cut: what is too bright in the dark counts by the dark"
     ] = 0.0
     darkness: Annotated[
-        float, "share of a crop's light that is lost, less what is won: linear, so that noise in a reference moves it "
-               "nowhere; against terms that would rather be too dark"
+        float, "share of a crop's light that is lost, less what is won: linear up to twice the reference, so that "
+               "noise in it moves no minimum; against terms that would rather be too dark"
     ] = 0.0
     noise2noise: Annotated[
         float, "squared error relative to the prediction, (d - y)^2 / (d^2 + 0.01), uncut: safe for noisy references"
@@ -83,7 +83,7 @@ def log_relative(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def leaks(prediction: Tensor, target: Tensor) -> Tensor:
-    """Mean over crops of log(mean((d - y)^2 / (m^2 + 0.01)) + 1e-3), m = max(|smooth(y)|, |d| / 4), outliers saturated.
+    """Mean over crops of log(mean((d - y)^2 / (m^2 + 0.01)) + 1e-3), m = max(smooth(|y|), |d| / 4), outliers saturated.
 
     The reference's own noise must not divide: what is dark by chance would count most, and the minimum be too dark.
     """
@@ -94,15 +94,15 @@ def leaks(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def darkness(prediction: Tensor, target: Tensor) -> Tensor:
-    """Mean over crops and colours of 1 - mean(d) / mean(y), between -1 and 1; 0 for a crop that should be black."""
+    """Mean over crops and colours of 1 - mean(d) / mean(y), at least -1; 0 for a colour that should be black."""
     light = target.mean((2, 3))
     lit = light > EPSILON
     lost = 1 - prediction.mean((2, 3)) / torch.where(lit, light, 1)
-    return (lost.clamp(-1, 1) * lit).mean()
+    return (lost.clamp_min(-1) * lit).mean()
 
 
 def smoothed(picture: Tensor) -> Tensor:
-    """(B, 3, H, W): the bilateral mean of |picture| over SMOOTHING_WINDOW pixels, edges as log luminance has them."""
+    """(B, 3, H, W): bilateral mean of |picture| over SMOOTHING_WINDOW pixels; edges are of the colours' mean log."""
     radius = SMOOTHING_WINDOW // 2
     height, width = picture.shape[-2:]
     picture = picture.abs()

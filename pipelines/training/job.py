@@ -121,7 +121,9 @@ def _prepare(options: TrainOptions, group: Group, report: Callable[[str], None])
         with torch.device("meta"):
             hold_all_but(Denoiser(config), options.recipe.only)
     folder = RunFolder(options.out, config, options.recipe)
-    folder.read(torch.device("cpu"))
+    if folder.read(torch.device("cpu")) is None and options.start is None and options.recipe.only is not None:
+        raise UsageError(f"the recipe's only: trains the {options.recipe.only} of a network whose other parts are "
+                         f"trained; name its weights with --start")
     folder.require_room()
     if not can_draw():
         report("curve.png and panels are not drawn: install lbmc with its extra 'train'")

@@ -46,8 +46,8 @@ class Recipe:
 
     steps: Annotated[int, "length of the run"] = 4000
     only: Annotated[
-        str | None, "the one part of the network that is trained, such as generator, while all others stay as they "
-                    "start; null: all are trained"
+        str | None, "the one part of the network that is trained, such as generator of fast, while all else stays as "
+                    "it starts; null: all is trained"
     ] = None
     batch: Annotated[int, "crops a step, of all processes together"] = 4
     crop: Annotated[int, "pixels along a crop's side; smaller where a scene is smaller"] = 128

@@ -70,6 +70,7 @@ def test_the_papers_networks_are_trained_scored_and_kept(tmp_path: Path) -> None
     data.mkdir()
     for seed, name in enumerate(("one", "two")):
         write_pair(data, name, seed, samples=16, window=SQUARE)
+    (data / "two.json").write_text(json.dumps({"coc_95": 5.0}), "utf-8")
     words = (data, "--work", tmp_path / "work", "--score", f"val2={data}", "--steps", 2, "--json",
              tmp_path / "rows.json")
     run("benchmarks/paper.py", *words, "--only", "OPTIMIZED")
@@ -79,6 +80,7 @@ def test_the_papers_networks_are_trained_scored_and_kept(tmp_path: Path) -> None
     row = first["rows"]["OPTIMIZED.1"]
     assert (row["steps"], row["layers"], row["group"]) == (2, 2, "paper")
     assert set(row["scenes"]["val2"]) == {"one", "two"}
+    assert first["blurred"] == {"val2": ["two"]}
     assert all(0 < scene["relmse"] < 100 and 0 < scene["smape"] < 1 for scene in row["scenes"]["val2"].values())
     with SampleReader(tmp_path / "work" / "scenes" / "val2" / "one.deep.exr") as reader:
         assert reader.total == 8 * 32 * 32  # of 16

@@ -120,20 +120,26 @@ def test_smoothing_takes_noise_and_leaves_edges() -> None:
     draw = torch.Generator().manual_seed(6)
     clean = torch.full((1, 3, 32, 32), 0.2)
     clean[..., 16:] = 20.0
-    noisy = clean * (1 + 0.2 * torch.randn(clean.shape, generator=draw))
+    noisy = clean * (1 + 0.2 * torch.randn(clean.shape, generator=draw))  # of each colour; a mean of 9 has 0.067
     error = (smoothed(noisy) / clean - 1).square().mean((0, 1, 2)).sqrt()  # (32,) by distance from the edge
     assert float(error.max()) < 0.12
+    assert float(error.mean()) < 0.06
 
 
-def test_darkness_is_the_share_of_light_that_is_lost_and_has_one_slope_everywhere() -> None:
+def test_darkness_is_the_share_of_light_that_is_lost_with_one_slope_up_to_twice_the_light() -> None:
     weights = LossWeights(smape=0.0, darkness=1.0, relative=0.0, pooled=())
     assert float(total_loss(picture(0.3), picture(0.4), weights)) == pytest.approx(0.25)
     assert float(total_loss(picture(0.5), picture(0.4), weights)) == pytest.approx(-0.25)
     assert float(total_loss(picture(0.5), picture(0.0), weights)) == 0.0
+    assert float(total_loss(picture(1.3), picture(0.5), weights)) == -1.0
     slopes = []
-    for value in (0.1, 0.7):
+    for value in (0.1, 0.7, 1.3):
         prediction = torch.full((1, 3, 4, 4), value, requires_grad=True)
         total_loss(prediction, picture(0.5), weights).backward()
         assert prediction.grad is not None
         slopes.append(prediction.grad)
     torch.testing.assert_close(slopes[0], slopes[1])
+    assert bool((slopes[0] < 0).all())
+    assert bool((slopes[2] == 0).all())
+    red = picture(0.4) * torch.tensor([1.0, 0.0, 0.0])[:, None, None]
+    assert float(total_loss(picture(0.3), red, weights)) == pytest.approx(0.25 / 3)
