@@ -106,7 +106,7 @@ def cache_scene(files: SceneFiles, folder: Path, threads: int | None = None) -> 
     """Writes one scene's arrays, block by block of its rows.
 
     Raises InputError, naming the file: a deep file that cannot be read or is too small, a reference that cannot be
-    read, has another data window, is not finite or black.
+    read, has another data window, is not finite or black, halves of one that are the same.
     """
     with SampleReader(files.deep, threads=threads) as reader, ExitStack() as outputs:
         window = reader.header.data_window
@@ -115,6 +115,9 @@ def cache_scene(files: SceneFiles, folder: Path, threads: int | None = None) -> 
             raise InputError(f"{files.deep}: {width}x{height} pixels; training needs {SMALLEST_CROP}x{SMALLEST_CROP} "
                              f"or more")
         halves = [read_reference(path, window, files.deep.name) for path in files.references]
+        if len(halves) == 2 and np.array_equal(halves[0], halves[1]):
+            raise InputError(f"{files.references[0]} and {files.references[1].name} are the same picture; halves of a "
+                             f"reference are two independent renderings, so render one again, or remove it")
         target = np.stack(halves).mean(0, np.float64).astype(np.float32)
         counts: list[npt.NDArray[np.int32]] = []
         seen = survey(_noting(reader.blocks(), counts))

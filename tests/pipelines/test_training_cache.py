@@ -181,6 +181,10 @@ def black_reference(folder: Path) -> None:
     write_flat(folder / "scene1.ref.exr", dict.fromkeys("RGB", np.zeros((SIZE, SIZE), np.float32)))
 
 
+def copy_half(folder: Path) -> None:
+    shutil.copy(folder / "scene1.ref.exr", folder / "scene1.ref2.exr")
+
+
 def truncate_deep(folder: Path) -> None:
     path = folder / "scene1.deep.exr"
     path.write_bytes(path.read_bytes()[:-500])
@@ -195,6 +199,7 @@ def truncate_deep(folder: Path) -> None:
         (poison_reference, "scene1.ref.exr: NaN or Inf"),
         (colourless_reference, "scene1.ref.exr: no channel R"),
         (black_reference, "scene1.ref.exr: .*no light"),
+        (copy_half, "scene1.ref.exr and scene1.ref2.exr are the same picture"),
         (truncate_deep, "scene1.deep.exr"),
     ],
 )
