@@ -32,6 +32,7 @@ RECIPE = replace(OUR_RECIPE, steps=120, warmup=20, crop=64)
 UNET = SMALL_FAST.unet
 NO_POOLED = replace(RECIPE.loss, pooled=())
 NOISE2NOISE = LossWeights(smape=0.0, relative=0.0, noise2noise=1.0, pooled=())
+LEAKS = replace(RECIPE.loss, relative=0.15, leaks=0.15)
 CLEAN_FINISH = LossWeights(smape=1.0, relative=0.1, pooled=())
 
 
@@ -108,6 +109,8 @@ CHANGES = (
     Change(KERNELS, "9x9 at two levels", replace(SMALL_FAST, kernel_sizes=(9, 9, *SMALL_FAST.kernel_sizes[2:]))),
     Change(KERNELS, "9x9 finest window, 16 features", replace(WIDE, affinity_features=16)),
     Change(KERNELS, "9x9 finest window, filtered guides", replace(WIDE, filtered_guides=True)),
+    Change(TRAINING, "loss with leaks", recipe=replace(RECIPE, loss=LEAKS)),
+    Change(TRAINING, "loss with leaks and darkness", recipe=replace(RECIPE, loss=replace(LEAKS, darkness=0.3))),
     Change(KERNELS, "twice the penalty of glare", replace(SMALL_FAST, glare_per_level=1.0)),
 )
 """In order of importance: what a short evening gets done."""
