@@ -23,7 +23,7 @@ from tests.end_to_end.scenes import random_weights
 from tests.runner import in_process
 
 HOME = Path(__file__).resolve().parents[2]
-ROOM = 170 << 20
+ROOM = 195 << 20
 """Bytes of address space above what a bench of a few samples takes: enough for all but a network on 1.7 million."""
 LITTLE = """
 import re, resource, sys
