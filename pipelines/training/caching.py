@@ -17,10 +17,10 @@ import numpy.typing as npt
 from deep_io.atomic import atomic_output
 from deep_io.csr import offsets_of, pixels_of
 from deep_io.errors import InputError
-from deep_io.flat import read_flat
 from deep_io.path_samples import PathSamples, SampleReader
 from deep_io.samples import Window
 from model.metrics import common_scale
+from pipelines.flat_pictures import FlatPicture, check_halves, mean_of_halves, read_rgb
 from pipelines.scene_names import DEEP, REFERENCE, other_half_of, reference_of, scene_name
 from pipelines.survey import survey
 from pipelines.training.cache import (
@@ -114,11 +114,11 @@ def cache_scene(files: SceneFiles, folder: Path, threads: int | None = None) -> 
         if min(height, width) < SMALLEST_CROP:
             raise InputError(f"{files.deep}: {width}x{height} pixels; training needs {SMALLEST_CROP}x{SMALLEST_CROP} "
                              f"or more")
-        halves = [read_reference(path, window, files.deep.name) for path in files.references]
-        if len(halves) == 2 and np.array_equal(halves[0], halves[1]):
-            raise InputError(f"{files.references[0]} and {files.references[1].name} are the same picture; halves of a "
-                             f"reference are two independent renderings, so render one again, or remove it")
-        target = np.stack(halves).mean(0, np.float64).astype(np.float32)
+        reference, *other = (read_reference(path, window, files.deep.name) for path in files.references)
+        target = reference.rgb
+        if other:
+            check_halves(reference, *other)
+            target = mean_of_halves(reference, *other).astype(np.float32)
         counts: list[npt.NDArray[np.int32]] = []
         seen = survey(_noting(reader.blocks(), counts))
         offsets = offsets_of(np.concatenate([block.ravel() for block in counts]))
@@ -187,26 +187,18 @@ def _halves(block: PathSamples, exposure: float, depth: float) -> npt.NDArray[np
     return half
 
 
-def read_reference(path: Path, window: Window, deep: str) -> FloatArray:
-    """(H, W, 3) float32 linear radiance of the reference of the file named `deep`, whose data window is `window`.
-
-    Raises InputError naming `path`.
-    """
-    image = read_flat(path)
-    channels = image.channels
-    missing = [name for name in "RGB" if name not in channels]
-    if missing:
-        raise InputError(f"{path}: no channel {missing[0]}; a reference needs R, G and B")
-    target = np.stack([channels[name] for name in "RGB"], -1).astype(np.float32)
-    if image.window != window:
-        raise InputError(f"{path}: {_place(image.window)}, but {deep} has {_place(window)}; render both alike")
-    if not np.isfinite(target).all():
+def read_reference(path: Path, window: Window, deep: str) -> FlatPicture:
+    """The reference of the file named `deep`, whose data window is `window`. Raises InputError naming `path`."""
+    picture = read_rgb(path)
+    if picture.window != window:
+        raise InputError(f"{path}: {_place(picture.window)}, but {deep} has {_place(window)}; render both alike")
+    if not np.isfinite(picture.rgb).all():
         raise InputError(f"{path}: NaN or Inf in the reference; render it again")
     try:
-        common_scale(target)
+        common_scale(picture.rgb)
     except ValueError as error:
         raise InputError(f"{path}: {error}; move the scene away") from None
-    return target
+    return picture
 
 
 def _place(window: Window) -> str:

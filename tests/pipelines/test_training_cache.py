@@ -197,9 +197,9 @@ def truncate_deep(folder: Path) -> None:
         (shrink_reference, "scene1.ref.exr: 39x40 pixels at .0, 0., but scene1.deep.exr has 40x40 pixels at .0, 0."),
         (shift_reference, "scene1.ref.exr: 40x40 pixels at .3, 0., but scene1.deep.exr has 40x40 pixels at .0, 0."),
         (poison_reference, "scene1.ref.exr: NaN or Inf"),
-        (colourless_reference, "scene1.ref.exr: no channel R"),
+        (colourless_reference, "scene1.ref.exr: no R, G, B channels"),
         (black_reference, "scene1.ref.exr: .*no light"),
-        (copy_half, "scene1.ref.exr and scene1.ref2.exr are the same picture"),
+        (copy_half, "scene1.ref.exr and .*scene1.ref2.exr are the same picture"),
         (truncate_deep, "scene1.deep.exr"),
     ],
 )
