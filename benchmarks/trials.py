@@ -154,7 +154,7 @@ def scores(method: Method, sets: dict[str, Scenes], folder: Path) -> tuple[Row, 
             d, r = k * read_rgb(folder / "scored.exr").rgb.astype("f8"), k * clean
             found.setdefault(name, {})[scene] = {
                 "relmse": round(relmse(d, r), 6), "trimmed": round(relmse_trimmed(d, r), 6),
-                "smape": round(smape(d, r), 6)}
+                "smape": round(smape(d, r), 6), "energy": round(float(d.mean() / r.mean()), 6)}
     return found, own(method.clock.take().cpu) / pixels * 1e6
 
 
