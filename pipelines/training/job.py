@@ -117,6 +117,9 @@ def _prepare(options: TrainOptions, group: Group, report: Callable[[str], None])
                          f"nothing about others, so name a folder of other scenes")
     if options.start is not None:
         starting_weights(options.start, config)
+    elif options.recipe.hold_layers:
+        raise UsageError("the recipe's hold_layers: holds the layers of weights that training starts from; name them "
+                         "with --start, also to resume")
     if options.recipe.only is not None:
         with torch.device("meta"):
             hold_all_but(Denoiser(config), options.recipe.only)

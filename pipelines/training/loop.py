@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 import time
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from deep_io.errors import LbmcError
@@ -33,6 +35,7 @@ from pipelines.training.validation import UNIT, validate
 TIME_IS_UP = 1  # below the numbers of the signals that end a run
 GUARDED = 1 / 3  # of the run, in which the guard against a collapsed partition fades
 ORDER_MARGIN = 0.02  # log units of depth by which a layer should be behind the one in front of it
+HELD_CELL = 8  # pixels: what a layer covers of so much is held, its edges may become better
 HOPELESS = 40  # steps in a row whose gradient is not finite: the weights have diverged, and would not change again
 
 Report = Callable[[str], None]
@@ -58,12 +61,22 @@ def disorder(layers: Layers) -> Tensor:
     return (torch.minimum(layers.coverage[:, :-1], layers.coverage[:, 1:]) * wrong).mean()
 
 
-class Objective(nn.Module):
-    """What a step minimises, as a module, so that DistributedDataParallel sees every parameter used."""
+def displacement(layers: Layers, before: Layers) -> Tensor:
+    """How much of the visible weight is in other layers than before: 0 to 1, over cells of HELD_CELL pixels."""
+    moved = F.avg_pool2d(layers.weight - before.weight, min(HELD_CELL, *layers.weight.shape[-2:]))
+    return moved.abs().sum(1).mean() / 2
 
-    def __init__(self, net: Denoiser, recipe: Recipe) -> None:
+
+class Objective(nn.Module):
+    """What a step minimises, as a module, so that DistributedDataParallel sees every parameter used.
+
+    before : the network whose layers are held, by `recipe.hold_layers`
+    """
+
+    def __init__(self, net: Denoiser, recipe: Recipe, before: Denoiser | None = None) -> None:
         super().__init__()
         self.net, self.recipe = net, recipe
+        self.before = None if before is None else before.requires_grad_(False)
 
     def forward(self, batch: Batch, step: int) -> Tensor:
         """The mean loss of the batch's crops, a scalar."""
@@ -77,6 +90,10 @@ class Objective(nn.Module):
             loss = loss + guard * (share * share.log()).sum(1).mean()
         if self.recipe.depth_order and wanted > 1 and "depth" in batch.samples.roles:
             loss = loss + self.recipe.depth_order * disorder(layers)
+        if self.before is not None and wanted > 1:
+            with torch.no_grad():
+                before = self.before(batch.samples, UNIT, wanted)
+            loss = loss + self.recipe.hold_layers * displacement(layers, before)
         # processes must agree on which parameters have a gradient: all have one, if only 0
         return loss + 0 * torch.stack([p.sum() for p in self.net.parameters() if p.requires_grad]).sum()
 
@@ -86,6 +103,8 @@ class Trainer:
 
     Every batch depends on the seed and the step alone, so a resumed run repeats the uninterrupted one, and any number
     of processes makes the same steps.
+
+    start : weights to begin with, and whose layers are held if the recipe says so, of a resumed run as well
 
     Raises UsageError where the folder holds a checkpoint of another network or recipe, InputError where it is broken.
     """
@@ -97,8 +116,10 @@ class Trainer:
         self.net = Denoiser(config).set_product_dtype(torch.bfloat16 if recipe.bfloat16 else None)
         if recipe.only is not None:
             hold_all_but(self.net, recipe.only)
+        before = None
         if start is not None:
             self.net.load_state_dict(start)
+            before = copy.deepcopy(self.net).to(group.device) if recipe.hold_layers else None
         self.averaged = Denoiser(config)
         self.averaged.load_state_dict(self.net.state_dict())
         for net in (self.net, self.averaged):
@@ -111,7 +132,7 @@ class Trainer:
             self.net.load_state_dict(found.net)
             self.averaged.load_state_dict(found.averaged)
             self.optimizer.load_state_dict(found.optimizer)
-        self.objective = group.wrap(Objective(self.net, recipe))
+        self.objective = group.wrap(Objective(self.net, recipe, before))
         self._torn = False  # weights and step count belong to different steps
         self._wasted = 0  # steps in a row that changed nothing
 

@@ -79,6 +79,10 @@ class Recipe:
     depth_order: Annotated[
         float, "weight of the guard of the layers' order: what lies behind the layer that should be behind it costs"
     ] = 2.0
+    hold_layers: Annotated[
+        float, "how much it counts that each layer covers of cells of 8 pixels what it does by the weights of --start, "
+               "so that all else can be trained on while the layers stay"
+    ] = 0.0
     bfloat16: Annotated[bool, "matrix products and convolutions in bfloat16"] = True
     seed: Annotated[int, "of everything that is random"] = 1
     validate_every: Annotated[int, "steps"] = 250

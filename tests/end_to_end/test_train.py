@@ -233,6 +233,7 @@ def test_weights_recipes_and_folders_that_do_not_fit_are_refused_before_training
         ((*start, "--network", "huge"), "--network huge: there are layer"),
         ((*start, "--set", "warmpu=3"), "no field warmpu"),
         ((*start, "--set", 'only="generator"'), "whose other parts are trained; name its weights with --start"),
+        ((*start, "--set", "hold_layers=1"), "holds the layers of weights that training starts from; name them with"),
         ((*start, "--set", 'only="kernels"'), "fast has no part 'kernels'; there are reducer, unet, partitioner, gen"),
         (("train", folder / "data", tmp_path / "file", "--validation", folder / "held", *QUICK), "file: is a file"),
     ]

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch import Tensor
 
 from deep_io.errors import InputError, LbmcError, UsageError
 from model import zoo
@@ -30,7 +31,7 @@ from pipelines.training.caching import build_cache
 from pipelines.training.drawing import PANEL_PIXELS, curve_png, panel_png
 from pipelines.training.group import ALONE, Group
 from pipelines.training.job import TrainOptions, starting_weights, train
-from pipelines.training.loop import HOPELESS, Trainer, disorder, learning_rate
+from pipelines.training.loop import HOPELESS, Trainer, disorder, displacement, learning_rate
 from pipelines.training.recipe import Augmentation, Recipe
 from pipelines.training.run_folder import CHECKPOINT, CURVE, CURVE_PICTURE, PANELS, RECIPE
 from pipelines.training.validation import pixel_means, validate
@@ -215,6 +216,35 @@ def test_the_finish_minimises_its_own_loss(cache: SampleCache, tmp_path: Path) -
     trainer = Trainer(SMALL, recipe, tmp_path)
     losses = [trainer.advance(random_batch(cache, recipe, step)) for step in range(recipe.steps)]
     assert [loss != 0 for loss in losses] == [True] * 3 + [False] * 3
+
+
+def test_displacement_is_the_share_of_the_weight_that_changed_layers() -> None:
+    def layers(front: Tensor) -> Layers:
+        visible = torch.zeros(1, 2, 6, *front.shape)
+        visible[0, :, 5] = torch.stack([front, 1 - front])
+        return to_layers(visible)
+
+    half = torch.full((16, 16), 0.5)
+    front = half.clone()
+    front[:8, :8] += 0.4  # one cell of four
+    assert float(displacement(layers(front), layers(half))) == pytest.approx(0.1)
+    front = half + 0.4 * (torch.arange(16) % 2 * 2 - 1)  # edges within a cell are free
+    assert float(displacement(layers(front), layers(half))) == pytest.approx(0, abs=1e-6)
+
+
+def test_layers_that_are_held_go_back_to_where_they_were(cache: SampleCache, tmp_path: Path) -> None:
+    nothing = LossWeights(smape=0, relative=0, pooled=())
+    recipe = dataclasses.replace(QUICK, steps=12, learning_rate=0.02, loss=nothing, partition_entropy=0.0,
+                                 depth_order=0.0, hold_layers=1.0, layers=((2, 1.0),))
+    torch.manual_seed(0)
+    trainer = Trainer(SMALL, recipe, tmp_path, Denoiser(SMALL).state_dict())
+    batch = random_batch(cache, recipe, 0)
+    assert trainer.advance(batch) == 0
+    with torch.no_grad():
+        trainer.net.partitioner.layers[-1].bias[0] += 2
+    losses = [trainer.advance(batch) for _ in range(recipe.steps)]
+    assert losses[0] > 0.1
+    assert losses[-1] < 0.5 * losses[0]
 
 
 def test_a_step_that_is_not_finite_is_skipped_and_counted(cache: SampleCache, tmp_path: Path) -> None:
