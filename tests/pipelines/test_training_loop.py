@@ -247,6 +247,24 @@ def test_layers_that_are_held_go_back_to_where_they_were(cache: SampleCache, tmp
     assert losses[-1] < 0.5 * losses[0]
 
 
+def test_a_resumed_run_holds_the_layers_of_its_start(cache: SampleCache, tmp_path: Path) -> None:
+    """Not those of the checkpoint that it resumes from."""
+    recipe = dataclasses.replace(QUICK, learning_rate=0.01, hold_layers=10.0)
+    torch.manual_seed(0)
+    start = Denoiser(SMALL).state_dict()
+    whole = Trainer(SMALL, recipe, tmp_path / "whole", start)
+    whole.run(cache, cache, lambda _: None)
+    stopped = Trainer(SMALL, recipe, tmp_path / "resumed", start)
+    for step in range(4):
+        stopped.advance(random_batch(cache, recipe, step))
+    stopped.save()
+    resumed = Trainer(SMALL, recipe, tmp_path / "resumed", start)
+    assert resumed.step == 4
+    resumed.run(cache, cache, lambda _: None)
+    for mine, theirs in zip(whole.averaged.parameters(), resumed.averaged.parameters(), strict=True):
+        assert torch.equal(mine, theirs)
+
+
 def test_a_step_that_is_not_finite_is_skipped_and_counted(cache: SampleCache, tmp_path: Path) -> None:
     trainer = Trainer(SMALL, dataclasses.replace(QUICK, steps=2, validate_every=2), tmp_path)
     batch = random_batch(cache, QUICK, 0)
