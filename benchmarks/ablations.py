@@ -112,6 +112,7 @@ CHANGES = (
     Change(TRAINING, "loss with leaks", recipe=replace(RECIPE, loss=LEAKS)),
     Change(TRAINING, "loss with leaks and darkness", recipe=replace(RECIPE, loss=replace(LEAKS, darkness=0.3))),
     Change(KERNELS, "twice the penalty of glare", replace(SMALL_FAST, glare_per_level=1.0)),
+    Change(KERNELS, "slope of texture", replace(SMALL_FAST, texture_slope=True)),
 )
 """In order of importance: what a short evening gets done."""
 

@@ -62,6 +62,7 @@ SMALL_FAST = replace(
     kernel_sizes=(5, 3, 3, 3, 3, 3),
     guide_gates=1,
     divisor_features=0,
+    texture_slope=False,
     filtered_guides=False,
     glare_per_level=0.5,
     glare_in_cells=0.0,

@@ -1,5 +1,5 @@
-"""The tables of docs/ablations.md, made from what benchmarks/ablations.py left in docs/results/ablations.json, and of
-losses on other scenes in leaks.json."""
+"""The tables of docs/ablations.md, made from what benchmarks/ablations.py left in docs/results/ablations.json, and on
+other scenes of losses in leaks.json, of textures in texture.json."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import numpy as np
 from model.metrics import geometric_mean
 
 HOME = Path(__file__).resolve().parent.parent
-ABLATIONS, LEAKS = (HOME / "docs" / "results" / name for name in ("ablations.json", "leaks.json"))
-LEAK_SETS = {"watched": "20 watched", "shared": "12 further"}
+ABLATIONS, LEAKS, TEXTURE = (HOME / "docs" / "results" / f"{name}.json" for name in ("ablations", "leaks", "texture"))
+OTHER_SETS = {"watched": "20 watched", "shared": "12 further"}
 BASE, LAYER_TOPICS = "base", ("", "layers")
 MEANS: Mapping[str, Callable[[list[float]], float]] = {
     "relmse": geometric_mean, "trimmed": geometric_mean, "smape": lambda values: float(np.mean(values))}
@@ -119,22 +119,22 @@ def planned_changes() -> dict[str, str]:
     return {change.name: change.topic for change in CHANGES}
 
 
-def leaks() -> str:
-    """Losses on scenes of their own, by seed: relMSE and SMAPE over the base's, and how far energy is off."""
+def by_seed(path: Path) -> str:
+    """Changes on other scenes, seed by seed: relMSE and SMAPE over the base's, and how far energy is off."""
     found: dict[str, list[Row]] = {}
-    for row in json.loads(LEAKS.read_text("utf-8"))["rows"].values():
+    for row in json.loads(path.read_text("utf-8"))["rows"].values():
         found.setdefault(row["name"], []).append(row)
-    head = ["of the base's, by seed", "seeds", *(f"{word}, {words}" for words in LEAK_SETS.values()
+    head = ["of the base's, by seed", "seeds", *(f"{word}, {words}" for words in OTHER_SETS.values()
                                                  for word in ("relMSE", "SMAPE", "energy off"))]
     lines = []
     for name, rows in found.items():
         cells: list[list[float]] = []
-        for scenes in LEAK_SETS:
+        for scenes in OTHER_SETS:
             mine, base = ([list(row["scenes"][scenes].values()) for row in part] for part in (rows, found[BASE]))
             cells += [[MEANS[key]([scene[key] for scene in one]) / MEANS[key]([scene[key] for scene in other])
                        for one, other in zip(mine, base, strict=True)] for key in ("relmse", "smape")]
             cells.append([float(np.mean([abs(scene["energy"] - 1) for scene in one])) for one in mine])
-        digits = [2, 2, 3] * len(LEAK_SETS)
+        digits = [2, 2, 3] * len(OTHER_SETS)
         lines.append([name, str(len(rows)), *(", ".join(f"{value:.{count}f}" for value in cell)
                                               for cell, count in zip(cells, digits, strict=True))])
     return markdown(head, lines)
@@ -143,5 +143,6 @@ def leaks() -> str:
 ABLATION_TABLES: Mapping[str, Callable[[], str]] = {
     "ablations": lambda: changes(load(), planned_changes()),
     "ablations-base": lambda: seeds(load()),
-    "ablations-leaks": leaks,
+    "ablations-leaks": lambda: by_seed(LEAKS),
+    "ablations-texture": lambda: by_seed(TEXTURE),
 }

@@ -79,6 +79,7 @@ class Config:
     guide_gates: Literal[1, 3] = 1  # one for all guides of a pixel, or one each for normal, depth and divisor
     demodulation: bool = True  # mix in a path whose kernels average radiance divided by albedo + specular
     divisor_features: int = 0  # learned features of the kernel that filters the divisor, beside the divisor itself
+    texture_slope: bool = False  # how much radiance follows the divisor is also measured behind each kernel
     filtered_guides: bool = False  # mix guides with themselves behind the divisor's kernel, as much as is predicted
     glare_per_level: float = 0.5  # what a log unit of glare takes from a source's logit at each coarser level, gated
     glare_in_cells: float = 0.0  # and at all of these levels alike, not gated
@@ -100,6 +101,8 @@ class Config:
             raise ValueError("without demodulation no divisor is filtered")
         if self.filtered_guides and not self.demodulation:
             raise ValueError("without demodulation there is no kernel to filter guides by")
+        if self.texture_slope and not self.demodulation:
+            raise ValueError("without demodulation nothing is measured against a divisor")
         if self.kernel == "direct" and len(self.kernel_sizes) > 1:
             if self.variant == "sample_splat":
                 raise ValueError("kernels per sample work at the full resolution only")
@@ -191,6 +194,7 @@ FAST = Config(
     kernel_sizes=(9, 5, 3, 3, 3, 3),
     guide_gates=3,
     divisor_features=4,
+    texture_slope=True,
     filtered_guides=True,
     glare_per_level=1.0,
     glare_in_cells=0.25,

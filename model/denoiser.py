@@ -19,7 +19,6 @@ from model.direct import filter_direct, make_generators, splat_samples
 from model.features import FrameScale, log_radiance
 from model.guided import (
     GUIDED_COLUMNS,
-    demodulated_lights,
     filter_guided,
     generator_sizes,
     guide_values,
@@ -249,8 +248,6 @@ class Denoiser(nn.Module):
         if self.config.kernel == "affinity":
             values.append(guide_values(samples, scale))
         values += [embedding.to(values[0].dtype), *extra_values(samples)]
-        if self.config.demodulation:
-            values += demodulated_lights(samples)
         result = splat(log_weight, log_partition, columns(values), segments)
         return columns([result.log_n[..., None], result.log_w[..., None], result.values])
 

@@ -23,24 +23,23 @@ GUIDE_WIDTHS = (3, 1, 3)
 DIVISOR = slice(4, 7)  # of the guides
 GLARE_SCALE = 2.0  # of glare as a feature
 GLARE_START = 3.0  # log(1 + exposure L): radiance about 20 times the frame's middle
+BLACK = 1e-6  # of the frame's middle
+FLAT = 1e-3  # variance of the divisor, over its square, that says little about the radiance
 DIVISOR_GUIDE_SCALE = 6.0  # the divisor's own, sharper kernel
 
 # Columns of a splat: log n, log w, then per unit of occupancy those of `basic_values`, of `guide_values`, embedding.
 RADIANCE = slice(2, 5)
-REDUCED = slice(BASIC_COLUMNS, 10)  # demodulated radiance
-GUIDES = slice(10, 17)  # normal, log depth, divisor
-GUIDED_COLUMNS = 17
+GUIDES = slice(BASIC_COLUMNS, 14)  # normal, log depth, divisor
+GUIDED_COLUMNS = 14
 
 
 def guide_values(samples: Samples, scale: FrameScale) -> Tensor:
-    """(N, 10) demodulated radiance, normal, log depth, divisor; 0 where a role is absent."""
-    radiance = samples.roles["radiance"]
+    """(N, 7) normal, log depth, divisor; 0 where a role is absent."""
     hit, depth = hit_depth(samples, scale)
-    normal = torch.zeros_like(radiance)
+    normal = torch.zeros_like(samples.roles["radiance"])
     if "normal" in samples.roles:
         normal = torch.where(hit, samples.roles["normal"], normal)
-    by = divisor(samples)
-    return columns([radiance / by, normal, log_depth(depth, scale.depth), by])
+    return columns([normal, log_depth(depth, scale.depth), divisor(samples)])
 
 
 def glare(radiance: Tensor, exposure: float) -> Tensor:
@@ -52,23 +51,16 @@ def glare(radiance: Tensor, exposure: float) -> Tensor:
     return (log_radiance(radiance.amax(1, keepdim=True), exposure) - GLARE_START).clamp_min(0)
 
 
-def demodulated_lights(samples: Samples) -> list[Tensor]:
-    """[(N, lights)] the lights among `samples.extra`, demodulated as radiance is, or nothing."""
-    if samples.extra is None or not samples.lights:
-        return []
-    lights = samples.extra[:, : samples.lights]
-    return [lights / divisor(samples).repeat(1, samples.lights // 3)]
-
-
 def generator_sizes(config: Config) -> tuple[int, ...]:
     """What the generator predicts per layer: features, bias and preference per level, gates of guides and glare;
-    with demodulation also the mix; gate, bias and features of the divisor's kernel; and how much of each guide is to
-    be its filtered self."""
+    with demodulation also the mix; gate, bias and features of the divisor's kernel; how much of each guide is to be
+    its filtered self; and how much of the mix the measured slope is to be."""
     levels = len(config.kernel_sizes)
     sizes = (config.affinity_features, levels, levels, config.guide_gates, 1)
     if not config.demodulation:
         return sizes
-    return (*sizes, 1, 1, 1, config.divisor_features, len(GUIDE_WIDTHS) if config.filtered_guides else 0)
+    filtered_guides = len(GUIDE_WIDTHS) if config.filtered_guides else 0
+    return (*sizes, 1, 1, 1, config.divisor_features, filtered_guides, int(config.texture_slope))
 
 
 def initial_guides(config: Config) -> Tensor:
@@ -99,7 +91,7 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
 
     active : which cells of targets are computed, see `affinity_filter`
 
-    planes (B*L, K, H, W): GUIDED_COLUMNS, extra values and, with demodulation, the first `lights` of them demodulated;
+    planes (B*L, GUIDED_COLUMNS + E, H, W), of the E extra values the first `lights` are parts of the radiance;
     predictions (B*L, sum(generator_sizes), H, W) -> (B*L, 6 + E, H, W) per unit of filtered occupancy: radiance,
     coverage, coverage * depth, share, extra values; 0 where no source is in reach.
     """
@@ -109,7 +101,7 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
     features, bias, preference, gate, glare_gate, *divided = torch.split(predictions, list(generator_sizes(config)), 1)
     guides = planes[:, GUIDES] / own
     if config.demodulation:
-        mix, *kernel, amounts = divided
+        mix, *kernel, amounts, trust = divided
         guides, factor = _filtered_guides(guides, log_w, kernel, amounts, config, active)
     bright = glare(planes[:, RADIANCE] / own, scale.exposure)
     beyond = bright * (0.5 + torch.sigmoid(glare_gate))
@@ -121,19 +113,64 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
         gates = _for_each_guide(gates)
     features = features + torch.einsum("bghw,fg->bfhw", guides * gates, guide_matrix)
     features = torch.cat([features, GLARE_SCALE * beyond], 1)
-    reduced_too = [planes[:, REDUCED]] if config.demodulation else []
-    values = torch.cat([planes[:, FILTERED], share, *reduced_too, planes[:, GUIDED_COLUMNS:]], 1)
+    textures = []
+    if config.demodulation:
+        by = planes[:, GUIDES][:, DIVISOR]
+        textures = [by, *(_products(planes[:, RADIANCE], by, own) if config.texture_slope else [])]
+    values = torch.cat([planes[:, FILTERED], share, *textures, planes[:, GUIDED_COLUMNS:]], 1)
     out = affinity_filter(features, bias, preference, log_n, values, config.kernel_sizes, active)
     if not config.demodulation:
         return out
-    plain, others, reduced, extra = torch.split(out, [3, 3, 3, out.shape[1] - 9], 1)
-    amount = torch.sigmoid(mix) * _known(factor)  # without a factor the plain path stands
-    color = torch.lerp(plain, reduced * factor, amount)
-    if not extra.shape[1]:
-        return torch.cat([color, others], 1)
-    light, data, reduced = torch.split(extra, [lights, extra.shape[1] - 2 * lights, lights], 1)
-    light = torch.lerp(light, reduced * factor.repeat(1, lights // 3, 1, 1), amount)
-    return torch.cat([color, others, light, data], 1)
+    rest = out.shape[1] - 9 - lights - 2 * config.texture_slope
+    color, coverage, share, averaged, products, light, data = torch.split(
+        out, [3, 2, 1, 3, 2 * config.texture_slope, lights, rest], 1)
+    amount = torch.sigmoid(mix)
+    if config.texture_slope:
+        amount = torch.lerp(amount, _slope(color, averaged, products, share, scale.exposure), torch.sigmoid(trust))
+    gain = torch.lerp(torch.ones_like(factor), _texture(factor, share, averaged), amount)
+    return torch.cat([color * gain, coverage, share, light * gain.repeat(1, lights // 3, 1, 1), data], 1)
+
+
+def _products(radiance: Tensor, by: Tensor, own: Tensor) -> list[Tensor]:
+    """[radiance times divisor, divisor squared], (B*L, 1, H, W) each, per unit of occupancy as both of these are."""
+    return [_mean_product(radiance, by / own), _mean_product(by, by / own)]
+
+
+def _slope(radiance: Tensor, averaged: Tensor, products: Tensor, share: Tensor, exposure: float) -> Tensor:
+    """(B*L, 1, H, W) 0..1: how much radiance follows the divisor among the sources of a kernel, 1 if in proportion.
+
+    The slope of a local linear regression, as of the guided filter (He et al. 2010), over that of a line through 0. All
+    planes are behind the kernel, per unit of occupancy. Over a flat divisor, and where it is black, it is 0.
+    """
+    some = share > torch.finfo(share.dtype).tiny ** 0.5
+    per_weight = torch.where(some, 1 / torch.where(some, share, 1), 0)
+    light, by = radiance * per_weight, averaged * per_weight
+    together, squared = (products * per_weight).split(1, 1)
+    covariance = together - _mean_product(light, by)
+    variance = squared - _mean_product(by, by)
+    one = torch.ones_like(by)
+    bright = _mean_product(light, one)
+    lit = (bright * exposure > BLACK) & some  # the derivative divides by it
+    line = bright * (variance.clamp_min(0) + FLAT * squared)
+    return torch.where(lit, covariance * _mean_product(by, one) / torch.where(lit, line, 1), 0).clamp(0, 1)
+
+
+def _mean_product(first: Tensor, second: Tensor) -> Tensor:
+    """Two (B, 3, H, W) -> (B, 1, H, W): mean over the colours of their product."""
+    return (first * (second / 3)).sum(1, keepdim=True)
+
+
+def _texture(factor: Tensor, share: Tensor, averaged: Tensor) -> Tensor:
+    """(B*L, 3, H, W): by how much a target is lighter or darker than what its kernel averaged; 1 where that is unknown.
+
+    The filtered radiance over the divisor behind the same kernel is the light that falls in, whichever surfaces it
+    averages; over every sample's own divisor, dark surfaces would count most, and add light where surfaces mix.
+
+    factor : the target's divisor, per unit of its own weight, 0 if unknown; share (B*L, 1, H, W) and averaged: own
+        weight and divisor behind the kernel, per unit of occupancy
+    """
+    known = (averaged > torch.finfo(averaged.dtype).tiny ** 0.5) & _known(factor)
+    return torch.where(known, factor * share / torch.where(known, averaged, 1), 1)
 
 
 def _filtered_guides(guides: Tensor, log_w: Tensor, kernel: list[Tensor], amounts: Tensor, config: Config,
