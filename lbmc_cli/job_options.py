@@ -19,9 +19,10 @@ def _layers(ctx: click.Context, parameter: click.Parameter, value: str) -> int |
     raise click.BadParameter(f"{value!r} is not auto or a number from 1 to {ALL_LAYERS}", ctx, parameter)
 
 
-def job_choices(overwrite: bool, skip_existing: bool, no_adapt: bool, **choices: Any) -> dict[str, Any]:
+def job_choices(overwrite: bool, skip_existing: bool, no_adapt: bool, light: str, **choices: Any) -> dict[str, Any]:
     """The groups' values as the fields of DenoiseOptions."""
-    return {"existing": existing_choice(overwrite, skip_existing), "adapt": not no_adapt, **choices}
+    return {"existing": existing_choice(overwrite, skip_existing), "adapt": not no_adapt, "light": light == "held",
+            **choices}
 
 
 job_options = together(
@@ -42,6 +43,13 @@ job_options = together(
         "--no-adapt",
         is_flag=True,
         help="Model everything, also what the survey finds the scene does not need.",
+    ),
+    option(
+        "--light",
+        type=click.Choice(["held", "free"]),
+        default="held",
+        show_default=True,
+        help="Light of the whole picture: held to that of its samples, or free, for parts of one to be put together.",
     ),
     option(
         "--exposure",

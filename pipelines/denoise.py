@@ -34,6 +34,7 @@ from pipelines.ids import IdChannel, find_ids, ranked_ids
 from pipelines.inference import FrameLayers, denoise_bands
 from pipelines.jobs import FrameSkippedError, JobReport, run_frames
 from pipelines.keep import BEAUTY, WRITTEN, find_kept, kept_channels
+from pipelines.light import hold_light
 from pipelines.mirrors import ALL_FOUR, ALONE
 from pipelines.network import choose_device, find_weights, load_network, product_dtype
 from pipelines.options import DenoiseOptions
@@ -222,6 +223,8 @@ class Job:
         """Denoises a frame and writes the files wanted; returns how many values were clamped to half's range."""
         layers = denoise_bands(reader, self.net, plan.shot.scale, plan.roles, plan.shot.layers, plan.bands, update,
                                plan.held, plan.survey.cells if plan.adapt else None, self.mirrors)
+        if self.options.light:
+            hold_light(layers, plan.survey.light, plan.survey.cells.mask, reader.carried_lights)
         return self.write(frame, wanted, plan, layers, reader.header)
 
     def written(self, aovs: Aovs, ids: Sequence[IdChannel]) -> list[tuple[str, Iterable[str]]]:

@@ -67,6 +67,8 @@ class DenoiseOptions:
     """1 to 5 layers. None: as many as the network has; with `adapt` 1 where the frame that decides hits nothing."""
     adapt: bool = True
     """False: no savings; every role is modelled, every cell filtered, with the network's own number of layers."""
+    light: bool = True
+    """Hold the light of the picture to that of its samples: `pipelines.light.hold_light`."""
     exposure: float | None = None
     """Factor that brings the radiance to the range the network was trained on. None: measured, see `exposure_from`."""
     exposure_from: str | None = None

@@ -35,6 +35,7 @@ class Survey:
     hits : samples that hit anything
     largest : the largest magnitude of each role but radiance and depth, over all hits; of a role that varies beyond
         STIRRING anywhere, only that it does: infinity
+    light : (H, W) float32, mean radiance of each pixel's samples, averaged over R, G, B; NaN where there is none
     cells : the cells with nothing to do
     repairs : non-finite values that were mended, by role
     """
@@ -47,6 +48,7 @@ class Survey:
     mixed: float | None
     hits: int
     largest: dict[str, float]
+    light: npt.NDArray[np.float32]
     cells: Cells
     repairs: dict[str, int]
 
@@ -70,6 +72,7 @@ class Surveyor:
     def __init__(self, display: Window) -> None:
         self._bins: dict[int, npt.NDArray[np.float64]] = {}
         self._areas: dict[int, npt.NDArray[np.float64]] = {}
+        self._light: list[npt.NDArray[np.float32]] = []
         self._depths: list[npt.NDArray[np.float64]] = []
         self._repairs: Counter[str] = Counter()
         self._pixels = self._empty = self._samples = self._mixed = self._hits = 0
@@ -80,7 +83,9 @@ class Surveyor:
     def add(self, block: PathSamples) -> None:
         """Takes in the next rows."""
         self._top = block.window.ymin if self._top is None else self._top
-        _add_bins(self._bins, self._areas, _pixel_luminance(block), block.window.ymin - self._top)
+        luminance = _pixel_luminance(block)
+        _add_bins(self._bins, self._areas, luminance, block.window.ymin - self._top)
+        self._light.append(np.where(block.counts > 0, luminance, np.nan).astype(np.float32))
         if "depth" in block.roles:
             self._depths.append(pixel_depth(block))
             self._mixed += int(_mixes_depth(block).sum())
@@ -105,6 +110,7 @@ class Surveyor:
             mixed=self._mixed / max(self._pixels, 1) if self._depths else None,
             hits=self._hits,
             largest=self._largest,
+            light=np.concatenate(self._light),
             cells=self._cells.result(),
             repairs=dict(self._repairs),
         )
