@@ -77,7 +77,7 @@ class Config:
     generator: tuple[int, ...] = (48, 48)  # hidden widths of the kernel generator
     affinity_features: int = 8
     guide_gates: Literal[1, 3] = 1  # one for all guides of a pixel, or one each for normal, depth and divisor
-    demodulation: bool = True  # mix in a path whose kernels average radiance divided by albedo + specular
+    demodulation: bool = True  # texture, of albedo + specular, is the target's own over what its kernel averaged
     divisor_features: int = 0  # learned features of the kernel that filters the divisor, beside the divisor itself
     texture_slope: bool = False  # how much radiance follows the divisor is also measured behind each kernel
     filtered_guides: bool = False  # mix guides with themselves behind the divisor's kernel, as much as is predicted

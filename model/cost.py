@@ -32,7 +32,8 @@ from model.partition import BASIC_COLUMNS
 from model.reducer import context_inputs
 
 BASIC = BASIC_COLUMNS - 2  # planes every variant filters: radiance (3), coverage, coverage * depth
-DIVISOR = 3  # planes of the demodulated path, and of the divisor
+DIVISOR = 3  # planes of the divisor
+SLOPE = 2  # and of the products that its slope is measured by
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ def _affinity(config: Config) -> list[Stage]:
     parameters, pixel, layer = _split_mlp(config.unet.out_channels, own, (*config.generator, outputs))
     guides = config.affinity_features * len(GUIDE_SCALES)
     taps = sum(size * size for size in config.kernel_sizes)
-    planes = BASIC + 1 + (DIVISOR if config.demodulation else 0) + (2 if config.texture_slope else 0)
+    planes = BASIC + 1 + (DIVISOR if config.demodulation else 0) + (SLOPE if config.texture_slope else 0)
     distances = DIVISOR + config.divisor_features
     smoothed = len(GUIDE_SCALES) if config.filtered_guides else DIVISOR
     by_divisor = DIVISOR_WINDOW**2 * (distances + smoothed) if config.demodulation else 0

@@ -1,4 +1,4 @@
-"""Per-sample features: what the sample reducer sees of each role, and the divisor of albedo demodulation.
+"""Per-sample features: what the sample reducer sees of each role, and the divisor, which texture is measured by.
 
 Radiance enters relative to the frame's exposure, depth relative to the frame's median hit depth, pixel quantities
 (motion, circle of confusion) squashed by x / (4 + |x|). Of a miss only the radiance is read from a file; its other
@@ -18,7 +18,7 @@ from model.samples import ROLE_WIDTHS, Samples
 DEPTH_LIMIT = 8.0  # |log(z / median)| beyond this carries no more information
 SQUASH_PIXELS = 4.0  # half of the range of x / (SQUASH + |x|) is reached at this many pixels
 PRODUCTS = (("coc", "lens"), ("motion", "time"))  # of roles, as features of their own; two wide
-DIVISOR_FLOOR = 0.03  # surfaces darker than this are not demodulated
+DIVISOR_FLOOR = 0.03  # surfaces darker than this count as so dark
 
 
 @dataclass(frozen=True)
@@ -102,10 +102,10 @@ def _encode_role(role: str, values: Tensor, hit: Tensor, scale: FrameScale) -> T
 
 
 def divisor(samples: Samples) -> Tensor:
-    """(N, 3): what demodulation divides radiance by: albedo + specular, 1 on misses and dark surfaces, <= 1."""
+    """(N, 3): what texture is measured by: albedo + specular, DIVISOR_FLOOR to 1; 1 on misses and what has none."""
     total = torch.zeros_like(samples.roles["radiance"])
     for role in ("albedo", "specular"):
         if role in samples.roles:
             total = total + samples.roles[role]
-    textured = (samples.coverage[:, None] > 0) & (total >= DIVISOR_FLOOR)
+    textured = (samples.coverage[:, None] > 0) & (total.amax(1, keepdim=True) > 0)
     return torch.where(textured, total.clamp(DIVISOR_FLOOR, 1.0), torch.ones_like(total))

@@ -87,7 +87,7 @@ def predict(generator: Mlp, layer_bias: Tensor, planes: Tensor, context: Tensor)
 
 def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Parameter, config: Config, scale: FrameScale,
                   lights: int, active: Tensor | None = None) -> Tensor:
-    """Filters each layer by affinity, radiance along two paths if `config.demodulation`.
+    """Filters each layer by affinity; with `config.demodulation` the texture of radiance is the target's own.
 
     active : which cells of targets are computed, see `affinity_filter`
 

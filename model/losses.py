@@ -22,6 +22,7 @@ OUTLIER = 100.0  # relative squared errors saturate here: one firefly in a targe
 BEYOND = 4.0  # times a target that a prediction is measured by its own size; above that noise is no excuse
 LEAK_CUT = 30.0  # the same of `leaks`, for fireflies in a reference: a leak stays below 1 / SMALLER^2
 SMALLER = 0.25  # times a prediction that a reference counts as at least: leaks are errors, not infinite ones
+GLARE = 2.0  # in the common scale, four times the mean: what is brighter counts as much for `darkness`
 SMOOTHING_WINDOW, SMOOTHING_SPREAD = 5, 0.4  # pixels, log units: what of a noisy reference is one surface
 LOG_FLOOR = 1e-3  # added to a crop's relative error before its logarithm
 SRGB_LINEAR, SRGB_SLOPE, SRGB_SCALE, SRGB_OFFSET, SRGB_POWER = 0.0031308, 12.92, 1.055, 0.055, 2.4
@@ -41,8 +42,9 @@ class LossWeights:
                "the prediction where that is more, outliers cut: what is too bright in the dark counts by the dark"
     ] = 0.0
     darkness: Annotated[
-        float, "share of a crop's light that is lost, less what is won: linear up to twice the reference, so that "
-               "noise in it moves no minimum; against terms that would rather be too dark"
+        float, "share of a crop's light that is lost, less what is won, against terms that would rather be too dark: "
+               "linear up to twice the reference. Lamps, highlights and fireflies count as four times the mean, or "
+               "making lamps larger would pay"
     ] = 0.0
     noise2noise: Annotated[
         float, "squared error relative to the prediction, (d - y)^2 / (d^2 + 0.01), uncut: safe for noisy references"
@@ -94,10 +96,13 @@ def leaks(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def darkness(prediction: Tensor, target: Tensor) -> Tensor:
-    """Mean over crops and colours of 1 - mean(d) / mean(y), at least -1; 0 for a colour that should be black."""
-    light = target.mean((2, 3))
+    """Mean over crops and colours of 1 - mean(d) / mean(y), at least -1; 0 for a colour that should be black.
+
+    d and y are clipped at GLARE: a lamp that is made larger by its edge is no light won.
+    """
+    light = target.clamp_max(GLARE).mean((2, 3))
     lit = light > EPSILON
-    lost = 1 - prediction.mean((2, 3)) / torch.where(lit, light, 1)
+    lost = 1 - prediction.clamp_max(GLARE).mean((2, 3)) / torch.where(lit, light, 1)
     return (lost.clamp_min(-1) * lit).mean()
 
 

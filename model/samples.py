@@ -159,7 +159,7 @@ class Samples:
     coverage : (N,) 0..1; features of a sample with coverage 0 (a miss) are never read
     roles : role -> (N, width) float32, see ROLE_WIDTHS; "radiance" always, linear, any scale
     extra : (N, E) values to filter by the radiance's own partition and kernels; never features. None: there are none
-    lights : how many of its first columns are parts of the radiance, filtered along the demodulated path too
+    lights : how many of its first columns are parts of the radiance, with the same texture
     squares : (N,) what each sample adds to the sum of squared weights of its pixel, which tells how noisy it is; None:
         the square of its weight. One that stands for several alike has theirs
     held : roles that are known to say nothing, such as motion where nothing moves: present, with features of 0

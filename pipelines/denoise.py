@@ -131,7 +131,7 @@ class Job:
             raise UsageError(f"--aov {aovs.depth}: {self.weights.name} was trained without depth; choose another model")
         reader.forget(reader.mapping.sources.keys() - {*roles, "coverage"})
         return FramePlan(source, seen, shot, roles, room.bands, room.memory, reader.mapping, aovs, ids,
-                         kept, held & {*present}, self.options.adapt, self.model)
+                         kept, held & {*present}, self.options.adapt, self.model, self.options.light)
 
     @property
     def model(self) -> str:
@@ -181,7 +181,7 @@ class Job:
             if self.options.dry_run:
                 head = f"{frame.source} -> {', '.join(map(str, targets))}"
                 print(head, *(f"  {line}" for line in plan.lines()), sep="\n", flush=True)
-                return DenoisedFrame(None, plan)
+                return DenoisedFrame(None, plan.without_pictures())
             tell_repairs(frame.source, plan.survey.repairs, progress)
             self._tell_surprises(plan, progress)
             clamped = self.produce(frame, targets, plan, reader, lambda done: progress.update(
@@ -189,7 +189,7 @@ class Job:
         if clamped:
             progress.note(f"{frame.target}: {clamped} values beyond half's range were clamped; "
                           f"--pixel-type float keeps them")
-        return DenoisedFrame(frame.target, plan)
+        return DenoisedFrame(frame.target, plan.without_pictures())
 
     def _tell_surprises(self, plan: FramePlan, progress: Progress) -> None:
         """Once for each thing that a frame has and the shot was decided to do without, and for each role that only one

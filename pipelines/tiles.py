@@ -22,6 +22,7 @@ BYTES_PER_PIXEL = 450  # context
 BYTES_PER_LAYER = 1100  # of each pixel: planes and predictions
 BYTES_PER_CARRIED = (16, 64)  # for each channel filtered besides the radiance: of each sample, of each pixel and layer
 BYTES_OF_RESULT = 24  # of each pixel and layer of a frame, whatever its bands
+BYTES_OF_LIGHT = 8  # of each pixel of a frame: what the survey keeps of its light, and what is made of that
 BYTES_OF_CONTEXT = 80  # of each pixel of a frame whose bands share a context
 BYTES_TO_DECODE = 600  # the same while it is made, before the first band
 DEFAULT_MEMORY = 8 << 30
@@ -74,7 +75,7 @@ class FrameLoad:
         pixel = BYTES_PER_PIXEL + self.layers * (BYTES_PER_LAYER + self.carried * per_layer)
         per_sample = BYTES_PER_SAMPLE + self.carried * per_sample + self.mirrored * BYTES_PER_MIRRORED
         samples = self.most_samples(rows) * per_sample
-        result = self.height * self.width * self.layers * BYTES_OF_RESULT
+        result = self.height * self.width * (self.layers * BYTES_OF_RESULT + BYTES_OF_LIGHT)
         return BYTES_BASE + result + rows * self.width * pixel + samples
 
     @property

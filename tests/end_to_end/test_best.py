@@ -21,7 +21,8 @@ from tests.runner import in_process, installed
 WINDOW = Window(-5, 3, 33, 91)
 """39 x 89 pixels: a multiple of no stride, and tall enough for several bands."""
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples/scenes/interior.deep.exr"
-FIXED = ("--exposure", "1", "--no-adapt", "--pixel-type", "float", "--threads", "1", "--progress", "none")
+FIXED = ("--exposure", "1", "--no-adapt", "--light", "free", "--pixel-type", "float", "--threads", "1", "--progress",
+         "none")
 """The survey's grids of bins and cells begin at a frame's first pixel, whichever way round it is."""
 
 

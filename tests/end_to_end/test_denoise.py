@@ -321,7 +321,7 @@ def test_a_dry_run_says_everything_and_writes_nothing(weights: Path, tmp_path: P
     run = in_process("denoise", source, tmp_path / "out.exr", "--model", weights, "--dry-run")
     assert run.code == 0
     assert list(tmp_path.iterdir()) == [source]
-    for word in ("radiance   <- R G B", "weighting: uniform", "layers: ", "exposure: ", "MiB"):
+    for word in ("radiance   <- R G B", "weighting: uniform", "layers: ", "light: held", "exposure: ", "MiB"):
         assert word in run.out
     run = in_process("denoise", source, tmp_path / "out.exr", "--model", weights, "--dry-run", "--keep", "absent")
     assert run.code == 3

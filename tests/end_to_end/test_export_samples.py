@@ -97,7 +97,7 @@ def test_the_copy_flattens_and_denoises_as_the_input_does(weights: Path, tmp_pat
     assert not (tmp_path / "again.exr").exists()
 
 
-@pytest.mark.parametrize("words", [["--form", "parts"], ["--aov", "albedo"], ["--contributions"]])
+@pytest.mark.parametrize("words", [["--form", "parts"], ["--aov", "albedo"], ["--contributions"], ["--light", "free"]])
 def test_samples_go_without_options_of_layers(words: list[str], weights: Path, tmp_path: Path) -> None:
     source = write_scene(tmp_path / "in.exr", noisy_scene(6, Window(0, 0, 9, 9)))
     run = in_process("export-layers", source, tmp_path / "out.exr", "--samples", "--model", weights, *words)

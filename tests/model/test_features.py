@@ -49,13 +49,13 @@ def test_extreme_features_stay_in_range() -> None:
     assert float(features["radiance"].max()) == 0  # negative radiance counts as none
 
 
-def test_divisor_is_one_on_misses_and_dark_surfaces() -> None:
+def test_divisor_is_one_on_misses_and_where_a_surface_has_no_colour() -> None:
     samples = random_samples(3, (1, 2, 2), 2)
     surface = torch.full_like(samples.roles["radiance"], 0.3)
-    surface[0], surface[1] = 0.001, 4.0
+    surface[0], surface[1], surface[4], surface[5, 0] = 0.001, 4.0, 0.0, 0.0
     samples = with_roles(samples, albedo=surface, specular=torch.zeros_like(surface))
     samples = dataclasses.replace(samples, coverage=torch.tensor([1, 1, 1, 0, 1, 1, 1, 1]).double())
-    assert divisor(samples)[:, 0].tolist() == [1, 1, 0.3, 1, 0.3, 0.3, 0.3, 0.3]
+    assert divisor(samples)[:, 0].tolist() == [0.03, 1, 0.3, 1, 1, 0.03, 0.3, 0.3]
 
 
 def test_an_absent_role_is_left_out_of_the_first_layer() -> None:

@@ -141,5 +141,11 @@ def test_darkness_is_the_share_of_light_that_is_lost_with_one_slope_up_to_twice_
     torch.testing.assert_close(slopes[0], slopes[1])
     assert bool((slopes[0] < 0).all())
     assert bool((slopes[2] == 0).all())
+    lamp = picture(0.4)
+    lamp[..., 1, 1] = 300.0
+    larger = lamp.clone()
+    larger[..., 1, 2] = 300.0  # its edge
+    assert -0.3 < float(total_loss(larger, lamp, weights)) < 0
+    assert float(total_loss(2 * lamp, lamp, weights)) > -1
     red = picture(0.4) * torch.tensor([1.0, 0.0, 0.0])[:, None, None]
     assert float(total_loss(picture(0.3), red, weights)) == pytest.approx(0.25 / 3)

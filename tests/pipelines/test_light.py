@@ -8,10 +8,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from pipelines import light
 from pipelines.inference import FrameLayers
 from pipelines.light import hold_light
 
-HEIGHT, WIDTH = 90, 140
+HEIGHT, WIDTH = 96, 144  # whole cells, so that the mirrored picture has the same ones
 NOTHING = np.zeros((HEIGHT, WIDTH), np.bool_)
 FloatArray = npt.NDArray[np.float32]
 
@@ -50,14 +51,14 @@ def test_light_that_is_lost_or_added_is_put_right(left: float) -> None:
     assert _light(layers) == pytest.approx(float(truth.mean()), rel=0.005)
 
 
-def test_where_samples_agree_the_picture_is_what_it_was() -> None:
+def test_where_samples_and_picture_agree_nothing_changes() -> None:
     truth = _truth()
     quiet = np.arange(WIDTH) < 70
     noise = np.where(quiet, 0, 0.5).astype(np.float32)
     before = truth * np.where(quiet, 1, 0.95).astype(np.float32)
     layers = _layers(before)
     hold_light(layers, _samples(truth, noise), NOTHING)
-    far = np.arange(WIDTH) < 60  # from any noise, if only a little
+    far = np.arange(WIDTH) < 40  # from any noise, by a few cells
     np.testing.assert_allclose(layers.beauty()[:, far, 0], before[:, far], rtol=1e-6)
     assert layers.beauty()[:, 100:].mean() > before[:, 100:].mean() * 1.02
 
@@ -74,7 +75,7 @@ def test_settled_pixels_are_left_as_they_are() -> None:
 
 def test_samples_that_tell_little_change_little() -> None:
     truth = _truth()
-    samples = _samples(truth, 30.0)
+    samples = _samples(truth, 30.0, seed=1)
     layers = _layers(truth)
     hold_light(layers, samples, NOTHING)
     wrong = abs(float(samples.mean()) / float(truth.mean()) - 1)
@@ -104,6 +105,29 @@ def test_lights_follow_and_nothing_else_does() -> None:
     np.testing.assert_array_equal(layers.extra[:, 3:], before.extra[:, 3:])
 
 
+@pytest.mark.parametrize("firefly", [30.0, 300.0, 3000.0])
+def test_a_firefly_makes_no_bright_square(firefly: float) -> None:
+    truth = np.ones((HEIGHT, WIDTH), np.float32)
+    samples = _samples(truth, 0.02)
+    samples[40, 70] = firefly
+    layers = _layers(truth)
+    hold_light(layers, samples, NOTHING)
+    assert layers.beauty().max() - 1 < 4.1 * min((firefly - 1) / truth.size, 0.02)
+
+
+def test_rows_are_gathered_in_blocks_without_a_seam(monkeypatch: pytest.MonkeyPatch) -> None:
+    truth = _truth()[:93, :131]  # cells at the end are smaller
+    samples = _samples(truth, 0.3)
+    found = []
+    for rows in (1000, 1):
+        monkeypatch.setattr(light, "ROWS", rows)
+        layers = _layers(truth * 0.95)
+        hold_light(layers, samples, NOTHING[:93, :131])
+        found.append(layers.color)
+    np.testing.assert_array_equal(*found)
+    assert not np.allclose(found[0], _layers(truth * 0.95).color)
+
+
 @pytest.mark.parametrize("factor", [1e-20, 1e-3, 1e20])
 def test_the_unit_of_radiance_is_irrelevant(factor: float) -> None:
     truth = _truth()
@@ -121,6 +145,15 @@ def test_a_mirrored_picture_gives_the_mirrored_result() -> None:
     hold_light(one, samples, NOTHING)
     hold_light(other, samples[::-1, ::-1].copy(), NOTHING)
     np.testing.assert_allclose(other.color[..., ::-1, ::-1], one.color, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 2), (3, 2), (2, 1), (16, 700), (300, 1)])
+def test_small_and_narrow_pictures(height: int, width: int) -> None:
+    truth = np.full((height, width), 2.0, np.float32)
+    layers = _layers(truth * 0.95)
+    hold_light(layers, _samples(truth, 0.05), np.zeros((height, width), np.bool_))
+    assert layers.color.shape == (2, 3, height, width)
+    assert (abs(layers.beauty() / 2 - 0.975) < 0.045).all()
 
 
 @pytest.mark.parametrize("hard", ["black", "firefly", "no samples", "one pixel", "negative"])
