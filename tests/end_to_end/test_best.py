@@ -21,8 +21,7 @@ from tests.runner import in_process, installed
 WINDOW = Window(-5, 3, 33, 91)
 """39 x 89 pixels: a multiple of no stride, and tall enough for several bands."""
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples/scenes/interior.deep.exr"
-FIXED = ("--exposure", "1", "--no-adapt", "--light", "free", "--pixel-type", "float", "--threads", "1", "--progress",
-         "none")
+FIXED = ("--exposure", "1", "--no-adapt", "--pixel-type", "float", "--threads", "1", "--progress", "none")
 """The survey's grids of bins and cells begin at a frame's first pixel, whichever way round it is."""
 
 
@@ -59,7 +58,7 @@ def mirrored(samples: DeepSamples, axis: int) -> DeepSamples:
 def denoised(folder: Path, name: str, samples: DeepSamples, model: str, *more: str) -> np.ndarray:
     """(H, W, 3) through the command."""
     source, output = write_scene(folder / f"{name}.exr", samples), folder / f"{name}.{model}.exr"
-    run = in_process("denoise", source, output, "--model", model, *FIXED, *more)
+    run = in_process("denoise", source, output, "--model", model, *FIXED, "--light", "free", *more)
     assert run.code == 0, run.err
     assert read_flat(output)[1]["lbmc:model"] == model
     return rgb(output)
