@@ -1,4 +1,4 @@
-"""Whole scenes, each a function that fills a Stage: outdoors, tabletops, floating clutter.
+"""Whole scenes, each a function that fills a Stage: outdoors, tabletops, floating clutter, abstract bodies.
 
 Interiors are in interiors.py; LAYOUTS lists them all with their shares.
 """
@@ -163,10 +163,62 @@ def floating(stage: Stage) -> None:
     stage.camera = camera
 
 
+def abstract(stage: Stage) -> None:
+    """A few large bodies, any material on any of them and on the walls, under lights of every size."""
+    rng = stage.rng
+    stage.kind = "abstract"
+    w, d, h = rng.uniform(3, 8, 3)
+    closed = rng.random() < 0.5
+    stage.tags.append("closed" if closed else "open")
+    scale = float(np.exp(rng.uniform(np.log(0.15), np.log(1.5))))
+    stage.add(g.quad([-w, 0, -d], [0, 0, 2 * d], [2 * w, 0, 0], scale), stage.bold_material())
+    if closed:
+        stage.environment = environment.uniform(rng, 0.0)
+        walls = [([-w, h, -d], [2 * w, 0, 0], [0, 0, 2 * d]), ([-w, 0, -d], [2 * w, 0, 0], [0, h, 0]),
+                 ([w, 0, d], [-2 * w, 0, 0], [0, h, 0]), ([-w, 0, d], [0, 0, -2 * d], [0, h, 0]),
+                 ([w, 0, -d], [0, 0, 2 * d], [0, h, 0])]
+        for corner, along, up in walls:
+            stage.add(g.quad(corner, along, up, scale), stage.bold_material())
+    else:
+        maps = (environment.studio, environment.spots, environment.sky, environment.sky)
+        stage.environment = maps[int(rng.integers(4))](rng)
+        if rng.random() < 0.4:
+            stage.add(g.quad([-w, 0, -d], [2 * w, 0, 0], [0, h, 0], scale), stage.bold_material())
+    if closed or rng.random() < 0.4:
+        _lights_of_every_size(stage, w, d, h)
+    for _ in range(int(rng.integers(3, 25))):
+        at = np.array([rng.uniform(-0.7, 0.7) * w, rng.uniform(0, 0.5) * h * (rng.random() < 0.3),
+                       rng.uniform(-0.7, 0.7) * d])
+        slot = stage.bold_material() if rng.random() < 0.85 else stage.any_material()
+        props.solid(stage, at, float(np.exp(rng.uniform(np.log(0.3), np.log(3.0)))), slot)
+
+    def camera(draw: np.random.Generator) -> Camera:
+        side = draw.choice([-1.0, 1.0])
+        origin = np.array([draw.uniform(-0.9, 0.9) * w, draw.uniform(0.3, 0.8) * h, side * draw.uniform(0.5, 0.95) * d])
+        target = np.array([draw.uniform(-0.4, 0.4) * w, draw.uniform(0.05, 0.5) * h, draw.uniform(-0.4, 0.4) * d])
+        return Camera.look_at(origin, target, draw.uniform(30, 75), draw.normal() * ROLL)
+
+    stage.camera = camera
+
+
+def _lights_of_every_size(stage: Stage, w: float, d: float, h: float) -> None:
+    """Panels under the ceiling and balls in the air, from a hand's width to most of the room, all of like power."""
+    rng = stage.rng
+    for _ in range(int(rng.integers(1, 5))):
+        size = float(np.exp(rng.uniform(np.log(0.1), np.log(3.0))))
+        at = np.array([rng.uniform(-0.7, 0.7) * w, h * rng.uniform(0.6, 0.97), rng.uniform(-0.7, 0.7) * d])
+        light = stage.light(stage.warm_or_cool(rng.uniform(3, 30) / size**2))
+        if rng.random() < 0.6:
+            stage.add(g.quad(at - np.array([size / 2, 0, size / 2]), [size, 0, 0], [0, 0, size]), light)
+        else:
+            stage.add(g.superellipsoid([size / 2] * 3, 1.0, 16), light, at - UP * size / 4)
+
+
 LAYOUTS: dict[str, tuple[float, Callable[[Stage], None]]] = {
     "interior": (0.52, interior),
     "outdoor": (0.22, outdoor),
     "tabletop": (0.17, tabletop),
     "floating": (0.09, floating),
+    "abstract": (0.0, abstract),
 }
-"""Name -> share of the scenes, function."""
+"""Name -> share of the scenes, function. What came later has none, so that every seed keeps its scene."""

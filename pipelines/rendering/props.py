@@ -30,11 +30,11 @@ def vessel(stage: Stage, at: Vector, size: float) -> None:
     stage.add(g.lathe(profile, 28), slot, at, movable=True)
 
 
-def solid(stage: Stage, at: Vector, size: float) -> None:
-    """A random smooth or boxy body."""
+def solid(stage: Stage, at: Vector, size: float, slot: int | None = None) -> None:
+    """A random smooth or boxy body, of the material in `slot` or of any."""
     rng = stage.rng
     shape = rng.choice(["ball", "soft box", "box", "ring", "cone", "knot", "blob"])
-    slot = stage.any_material()
+    slot = stage.any_material() if slot is None else slot
     if shape == "ball":
         mesh = g.superellipsoid([size] * 3, 1.0, 26)
     elif shape == "soft box":

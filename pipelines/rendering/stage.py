@@ -87,6 +87,19 @@ class Stage:
             return self.material("translucent", texture=self.textured())
         return self.surface_material()
 
+    def bold_material(self) -> int:
+        """An opaque material, each kind as likely as the next, metals in any colour."""
+        rng = self.rng
+        kind = str(rng.choice(["matte", "matte", "colored", "plastic", "roughplastic", "metal", "metal", "mirror",
+                               "principled", "principled"]))
+        if kind == "colored":
+            return self.material(kind)
+        alpha = float(np.exp(rng.uniform(np.log(0.01), np.log(0.6))))
+        if kind in ("metal", "mirror"):
+            return self.material(kind, alpha=alpha, tint=tuple(float(x) for x in textures.random_color(rng, 0.3, 0.95)))
+        return self.material(kind, texture=self.textured(), alpha=alpha, metallic=float(rng.integers(2)),
+                             clearcoat=float(rng.integers(2)))
+
     def glass(self) -> int:
         """Clear or lightly tinted smooth glass."""
         tint = (1.0, 1.0, 1.0) if self.rng.random() < 0.6 else tuple(

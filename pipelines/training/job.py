@@ -15,6 +15,7 @@ from deep_io.errors import InputError, UsageError
 from model import zoo
 from model.config import CONFIGS, FAST, Config
 from model.denoiser import Denoiser
+from model.widening import widened
 from pipelines.training.batches import crop_size
 from pipelines.training.cache import CACHE_VERSION, SampleCache
 from pipelines.training.caching import build_cache, scene_files
@@ -82,7 +83,7 @@ def _train(options: TrainOptions, group: Group, report: Callable[[str], None]) -
     group.first(lambda: _prepare(options, group, say))
     training, held_out = (SampleCache(folder) for folder in cache_folders(options))
     config = network_of(options)
-    start = starting_weights(options.start, config) if options.start is not None else None
+    start = starting_weights(options.start, config, options.recipe.seed) if options.start is not None else None
     trainer = Trainer(config, recipe, options.out, start, group)
     say(f"{len(training.entries)} scenes, {len(held_out.entries)} held out, crops of "
         f"{crop_size(training.entries, recipe)} pixels, {group.size} process{'es'[:2 * (group.size > 1)]} on "
@@ -165,18 +166,26 @@ def network_of(options: TrainOptions) -> Config:
     return CONFIGS[options.network]
 
 
-def starting_weights(path: Path, config: Config) -> dict[str, Tensor]:
-    """The weights of a file. Raises UsageError where it is none, or of another network than `config`."""
+def starting_weights(path: Path, config: Config, seed: int = 1) -> dict[str, Tensor]:
+    """The weights of a file, widened if `config` has more channels; `seed` is of what those start with.
+
+    Raises UsageError where it is no weight file, or of a network that `config` does not contain.
+    """
     weights = _found(path)
     changed = [name for name in differences(config.to_dict(), weights.config.to_dict()) if name != "name"]
-    if changed:
-        raise UsageError(f"--start: {path}: its network, {weights.config.name!r}, differs from the {config.name!r} to "
-                         f"be trained in {', '.join(changed)}; without --network, into a new folder, the file's is "
-                         f"trained")
     try:
-        return weights.load().state_dict()
+        net = weights.load()
+        if changed:
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(seed)
+                net = widened(net, config)
     except ValueError as error:
-        raise UsageError(f"--start: {error}") from None
+        if not changed:
+            raise UsageError(f"--start: {error}") from None
+        raise UsageError(f"--start: {path}: its network, {weights.config.name!r}, differs from the {config.name!r} to "
+                         f"be trained in {', '.join(changed)}, and is no narrower one of its kind ({error}); without "
+                         f"--network, into a new folder, the file's is trained") from None
+    return net.state_dict()
 
 
 def _found(path: Path) -> zoo.Weights:

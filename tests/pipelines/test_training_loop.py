@@ -405,6 +405,9 @@ def test_train_writes_weights_that_the_zoo_reads_and_training_starts_from(
     again = Trainer(SMALL, QUICK, tmp_path / "second", trained)
     for name, value in again.net.state_dict().items():
         assert torch.equal(value, trained[name])
+    wider = dataclasses.replace(SMALL, name="wider", generator=tuple(2 * width for width in SMALL.generator))
+    once, twice = (starting_weights(path, wider, seed=5) for _ in range(2))
+    assert all(torch.equal(value, twice[name]) for name, value in once.items())
 
 
 def test_a_network_with_fewer_layers_than_a_batch_asks_for_uses_all_it_has(cache: SampleCache, tmp_path: Path) -> None:
