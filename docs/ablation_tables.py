@@ -1,5 +1,5 @@
 """The tables of docs/ablations.md, made from what benchmarks/ablations.py left in docs/results/ablations.json, and on
-other scenes of losses in leaks.json, of textures in texture.json."""
+other scenes of losses in leaks.json."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from model.metrics import geometric_mean
 
 HOME = Path(__file__).resolve().parent.parent
-ABLATIONS, LEAKS, TEXTURE = (HOME / "docs" / "results" / f"{name}.json" for name in ("ablations", "leaks", "texture"))
+ABLATIONS, LEAKS = (HOME / "docs" / "results" / f"{name}.json" for name in ("ablations", "leaks"))
 OTHER_SETS = {"watched": "20 watched", "shared": "12 further"}
 BASE, LAYER_TOPICS = "base", ("", "layers")
 MEANS: Mapping[str, Callable[[list[float]], float]] = {
@@ -144,5 +144,4 @@ ABLATION_TABLES: Mapping[str, Callable[[], str]] = {
     "ablations": lambda: changes(load(), planned_changes()),
     "ablations-base": lambda: seeds(load()),
     "ablations-leaks": lambda: by_seed(LEAKS),
-    "ablations-texture": lambda: by_seed(TEXTURE),
 }

@@ -33,7 +33,7 @@ from pipelines.options import COMPRESSIONS
     "--samples",
     is_flag=True,
     help="Instead of layers, copy the samples of IN with each one's share in every layer: layer0.weight ... Goes with "
-    "none of --form, --contributions, --aov, --ids and --light.",
+    "none of --form, --contributions, --aov and --ids.",
 )
 @job_options
 @option(

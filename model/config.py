@@ -17,7 +17,7 @@ Widths = tuple[tuple[int, ...], ...]
 
 ALL_ROLES = ("radiance", "depth", "normal", "albedo", "specular", "roughness", "motion", "coc", "lens", "time")
 MAX_LAYERS = 5
-DIVISOR_WINDOW = 5  # pixels; demodulation multiplies by the divisor filtered over this window
+DIVISOR_WINDOW = 5  # pixels; a target's own texture is that of the divisor filtered over this window
 
 
 @dataclass(frozen=True)

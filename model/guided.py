@@ -1,4 +1,4 @@
-"""The affinity kernels' stage: what is splatted besides radiance, how kernels are predicted, the demodulated path.
+"""The affinity kernels' stage: what is splatted besides radiance, how kernels are predicted, whose texture is kept.
 
 Features for the affinity are predicted per layer and pixel; guides (normal, log depth, divisor) are added to them with
 a learned matrix, so that the kernel is a joint bilateral filter before any training. Guides of a few samples are noisy
@@ -139,8 +139,9 @@ def _products(radiance: Tensor, by: Tensor, own: Tensor) -> list[Tensor]:
 def _slope(radiance: Tensor, averaged: Tensor, products: Tensor, share: Tensor, exposure: float) -> Tensor:
     """(B*L, 1, H, W) 0..1: how much radiance follows the divisor among the sources of a kernel, 1 if in proportion.
 
-    The slope of a local linear regression, as of the guided filter (He et al. 2010), over that of a line through 0. All
-    planes are behind the kernel, per unit of occupancy. Over a flat divisor, and where it is black, it is 0.
+    Less than 1 where both light and texture are coloured: products are of the colours' means. The slope of a local
+    linear regression, as of the guided filter (He et al. 2010), over that of a line through 0. All planes are behind
+    the kernel, per unit of occupancy. Over a flat divisor, and where it is black, it is 0.
     """
     some = share > torch.finfo(share.dtype).tiny ** 0.5
     per_weight = torch.where(some, 1 / torch.where(some, share, 1), 0)

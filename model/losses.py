@@ -43,8 +43,8 @@ class LossWeights:
     ] = 0.0
     darkness: Annotated[
         float, "share of a crop's light that is lost, less what is won, against terms that would rather be too dark: "
-               "linear up to twice the reference. Lamps, highlights and fireflies count as four times the mean, or "
-               "making lamps larger would pay"
+               "linear up to twice the reference. What is brighter than four times the mean counts as just that: "
+               "making lamps larger would pay, else"
     ] = 0.0
     noise2noise: Annotated[
         float, "squared error relative to the prediction, (d - y)^2 / (d^2 + 0.01), uncut: safe for noisy references"

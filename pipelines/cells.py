@@ -45,6 +45,11 @@ class Cells:
         """(H, W) the pixels that pass through."""
         return self.passed[self.row_of][:, self.column_of]
 
+    def without_pictures(self) -> Cells:
+        """Only which cells pass."""
+        nothing = np.empty((0, 0), np.bool_)
+        return replace(self, known=nothing, alike=nothing, means=None)
+
     def lines(self) -> list[str]:
         """For a reader: nothing where no cell passes."""
         count = int(self.passed.sum())

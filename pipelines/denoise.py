@@ -131,7 +131,12 @@ class Job:
             raise UsageError(f"--aov {aovs.depth}: {self.weights.name} was trained without depth; choose another model")
         reader.forget(reader.mapping.sources.keys() - {*roles, "coverage"})
         return FramePlan(source, seen, shot, roles, room.bands, room.memory, reader.mapping, aovs, ids,
-                         kept, held & {*present}, self.options.adapt, self.model, self.options.light)
+                         kept, held & {*present}, self.options.adapt, self.model, self.light)
+
+    @property
+    def light(self) -> bool | None:
+        """Whether the picture's light is held; None where the job makes no picture."""
+        return self.options.light
 
     @property
     def model(self) -> str:

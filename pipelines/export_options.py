@@ -33,9 +33,9 @@ class ExportOptions(DenoiseOptions):
             raise ValueError(f"form must be one of {', '.join(FORMS)}, not {self.form}")
         if not self.target.lower().endswith(".exr"):
             raise ValueError(f"{self.target}: --form {self.form} writes OpenEXR; give OUT the extension .exr")
-        if self.samples and (self.form != "deep" or self.contributions or self.aovs or self.ids or not self.light):
+        if self.samples and (self.form != "deep" or self.contributions or self.aovs or self.ids):
             raise ValueError("--samples copies the input's own samples: it goes without --form, --contributions, "
-                             "--aov, --ids and --light")
+                             "--aov and --ids")
         if self.form == "deep" and self.contributions:
             raise ValueError("contributions are summed, but deep samples are composited by over; choose --form parts, "
                              "channels or files for them")

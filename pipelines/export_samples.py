@@ -53,6 +53,11 @@ class SamplesJob(Job):
 
     options: ExportOptions
 
+    @property
+    def light(self) -> None:
+        """Shares are no picture."""
+        return None
+
     @torch.inference_mode()
     def produce(self, frame: Frame, wanted: list[Path], plan: FramePlan, reader: FrameReader,
                 update: Callable[[float], None]) -> int:

@@ -1,8 +1,9 @@
 """The light of a picture, held to that of its samples.
 
 A network that is trained to err little in every pixel loses light where few samples carry much of it. What a frame's
-light is as a whole, its samples know better than any one pixel's: what they say is missing is given back, as far as
-their own noise lets them tell. It is spread over all that is noisy; where picture and samples agree, nothing changes.
+light is as a whole, its samples know better than any one pixel's: what they say is missing is given back, what they
+say is too much is taken, as far as their own noise lets them tell. It is spread over all that is noisy; where picture
+and samples agree, nothing changes. Only the mean of the colours is held: a pixel's colours are scaled alike.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import torch.nn.functional as F
 
 from pipelines.inference import FrameLayers
 
-CELL = 8  # pixels along a side; noise is told for three such cells
+CELL = 8  # pixels along a side, more or less; noise is told by the 5 x 5 cells around one
 ROWS = 32  # of cells, gathered at a time
 NOISY = 0.01  # relative squared difference of a pixel's samples and the picture; beyond it, all takes alike
 USUAL = 0.015  # of the light: what a network usually loses or adds, root mean square
@@ -72,20 +73,29 @@ class _Cells:
 def _gather(layers: FrameLayers, samples: FloatArray, counted: Mask) -> _Cells:
     """Some rows at a time, so that what is made of them takes little memory."""
     parts = []
-    for top in range(0, len(samples), ROWS * CELL):
-        rows = slice(top, top + ROWS * CELL)
+    down, along = _edges(samples.shape[0]), _edges(samples.shape[1])
+    for first in range(0, len(down) - 1, ROWS):
+        tall = down[first : first + ROWS + 1]
+        rows = slice(tall[0], tall[-1])
         known = counted[rows]
         shown = layers.color[:, :, rows].mean(1, dtype=np.float64).sum(0)
         lost = np.where(known, samples[rows] - shown, 0)
-        parts.append([_sums(plane) for plane in (known, np.where(known, shown, 0), lost, np.square(lost))])
+        parts.append([_sums(plane, tall - tall[0], along)
+                      for plane in (known, np.where(known, shown, 0), lost, np.square(lost))])
     return _Cells(*(np.concatenate(planes) for planes in zip(*parts, strict=True)))
 
 
-def _sums(plane: npt.NDArray[np.generic]) -> DoubleArray:
-    """(H, W) -> sums over cells, those at the end smaller."""
-    height, width = plane.shape
-    along = np.add.reduceat(plane, np.arange(0, width, CELL), 1, dtype=np.float64)
-    return np.add.reduceat(along, np.arange(0, height, CELL), 0)
+def _edges(size: int) -> npt.NDArray[np.int64]:
+    """(cells + 1,) where cells of about CELL pixels begin and end; the same from either side, as in a mirror."""
+    count = -(-size // CELL)
+    count += size % 2 and 1 - count % 2  # an odd size has no middle between two cells
+    half = np.arange(count // 2 + 1) * size // count
+    return np.concatenate([half, (size - half[::-1])[1 - count % 2 :]])
+
+
+def _sums(plane: npt.NDArray[np.generic], down: npt.NDArray[np.int64], along: npt.NDArray[np.int64]) -> DoubleArray:
+    """(H, W) -> sums over the cells between these edges."""
+    return np.add.reduceat(np.add.reduceat(plane, along[:-1], 1, dtype=np.float64), down[:-1], 0)
 
 
 def _smooth(cells: DoubleArray) -> DoubleArray:
@@ -97,8 +107,8 @@ def _smooth(cells: DoubleArray) -> DoubleArray:
     return smooth
 
 
-def _enlarged(cells: DoubleArray, size: tuple[int, ...]) -> FloatArray:
-    """Bilinear, cell by cell CELL x CELL pixels, cut to the size."""
+def _enlarged(cells: DoubleArray, size: tuple[int, int]) -> FloatArray:
+    """(rows, columns) -> (H, W), bilinear."""
     plane = torch.from_numpy(cells.astype(np.float32))[None, None]
-    picture: FloatArray = F.interpolate(plane, scale_factor=CELL, mode="bilinear", align_corners=False)[0, 0].numpy()
-    return picture[: size[0], : size[1]]
+    picture: FloatArray = F.interpolate(plane, size=size, mode="bilinear", align_corners=False)[0, 0].numpy()
+    return picture

@@ -44,7 +44,7 @@ class FramePlan:
     held : those it is told to say nothing
     adapt : whether the cells that the survey found to have nothing to do pass through
     model : which network, in words
-    light : whether the picture's light is held to that of its samples
+    light : whether the picture's light is held to that of its samples; None: no picture is made
     """
 
     source: Path
@@ -60,11 +60,13 @@ class FramePlan:
     held: frozenset[str] = frozenset()
     adapt: bool = False
     model: str = ""
-    light: bool = True
+    light: bool | None = True
 
     def without_pictures(self) -> FramePlan:
         """The same, for a report that outlives the frame."""
-        return replace(self, survey=replace(self.survey, light=np.empty((0, 0), np.float32)))
+        seen = self.survey
+        cells = seen.cells.without_pictures()
+        return replace(self, survey=replace(seen, light=np.empty((0, 0), np.float32), cells=cells))
 
     def lines(self) -> list[str]:
         """The plan, for `--dry-run`."""
@@ -80,7 +82,7 @@ class FramePlan:
             *([f"roles held, which say nothing here: {', '.join(sorted(self.held))}"] if self.held else []),
             f"exposure: {self.shot.scale.exposure:.6g}, depth scale: {self.shot.scale.depth:.6g}",
             f"layers: {self.shot.layers}",
-            f"light: {'held to that of the samples' if self.light else 'free'}",
+            *([] if self.light is None else [f"light: {'held to that of the samples' if self.light else 'free'}"]),
             *([] if seen.mixed is None else [f"depth mixes in {seen.mixed:.1%} of the pixels"]),
             *(seen.cells.lines() if self.adapt else ["not adapted: no role is held, every cell is filtered"]),
             *(f"AOV: {', '.join(group.outputs)} filtered as {group.kind}" for group in self.aovs.groups),

@@ -88,7 +88,7 @@ class Stage:
         return self.surface_material()
 
     def bold_material(self) -> int:
-        """An opaque material, each kind as likely as the next, metals in any colour."""
+        """An opaque material: matte, metal and principled each twice as likely as the others; metals in any colour."""
         rng = self.rng
         kind = str(rng.choice(["matte", "matte", "colored", "plastic", "roughplastic", "metal", "metal", "mirror",
                                "principled", "principled"]))

@@ -56,9 +56,9 @@ def mirrored(samples: DeepSamples, axis: int) -> DeepSamples:
 
 
 def denoised(folder: Path, name: str, samples: DeepSamples, model: str, *more: str) -> np.ndarray:
-    """(H, W, 3) through the command."""
+    """(H, W, 3) through the command, the network's own light unless told."""
     source, output = write_scene(folder / f"{name}.exr", samples), folder / f"{name}.{model}.exr"
-    run = in_process("denoise", source, output, "--model", model, *FIXED, "--light", "free", *more)
+    run = in_process("denoise", source, output, "--model", model, "--light", "free", *FIXED, *more)
     assert run.code == 0, run.err
     assert read_flat(output)[1]["lbmc:model"] == model
     return rgb(output)
@@ -69,7 +69,7 @@ def difference(left: np.ndarray, right: np.ndarray) -> float:
     return float(np.abs(left - right).max() / np.abs(left).max())
 
 
-@pytest.mark.parametrize("more", [(), ("--memory", "1MiB")], ids=["whole", "bands"])
+@pytest.mark.parametrize("more", [(), ("--memory", "1MiB"), ("--light", "held")], ids=["whole", "bands", "held"])
 @pytest.mark.parametrize("axis", [0, 1])
 def test_what_is_mirrored_comes_out_mirrored(axis: int, more: tuple[str, ...], tmp_path: Path) -> None:
     samples = scene()

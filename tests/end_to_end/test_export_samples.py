@@ -97,9 +97,17 @@ def test_the_copy_flattens_and_denoises_as_the_input_does(weights: Path, tmp_pat
     assert not (tmp_path / "again.exr").exists()
 
 
-@pytest.mark.parametrize("words", [["--form", "parts"], ["--aov", "albedo"], ["--contributions"], ["--light", "free"]])
+@pytest.mark.parametrize("words", [["--form", "parts"], ["--aov", "albedo"], ["--contributions"]])
 def test_samples_go_without_options_of_layers(words: list[str], weights: Path, tmp_path: Path) -> None:
     source = write_scene(tmp_path / "in.exr", noisy_scene(6, Window(0, 0, 9, 9)))
     run = in_process("export-layers", source, tmp_path / "out.exr", "--samples", "--model", weights, *words)
     assert run.code == 2
     assert "--samples" in run.err
+
+
+def test_the_light_is_not_spoken_of_where_no_picture_is_made(weights: Path, tmp_path: Path) -> None:
+    """A farm may have LBMC_LIGHT set for all of its jobs."""
+    source = write_scene(tmp_path / "in.exr", noisy_scene(6, Window(0, 0, 9, 9)))
+    plans = [in_process("export-layers", source, tmp_path / "out.exr", "--dry-run", "--model", weights, *words).out
+             for words in ((), ("--samples",), ("--samples", "--light", "free"))]
+    assert ["light:" in plan for plan in plans] == [True, False, False]

@@ -1,4 +1,4 @@
-"""Encodings: what reaches the network, what a miss and an absent role leave out, what demodulation divides by."""
+"""Encodings: what reaches the network, what a miss and an absent role leave out, what texture is measured by."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The demodulated path: the light that falls in is averaged across surfaces, their texture is the target's own."""
+"""Texture: the light that falls in is averaged across surfaces, their texture is the target's own."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MIX, TRUST = sum(generator_sizes(CONFIG)[:5]), -1  # rows of what is predicted
 def _denoised(samples: Samples, mix: float = 0.0, trust: float = -50.0) -> Tensor:
     """(3, H, W) in one layer by wide kernels that take no notice of surfaces.
 
-    mix : far below 0 the plain path, far above 0 the demodulated one; `trust` far above 0: as measured instead
+    mix : far below 0 the plain path, far above 0 the target's own texture; `trust` far above 0: as measured instead
     """
     net: Denoiser = random_network(CONFIG, 4)
     last = net.generator.layers[-1]

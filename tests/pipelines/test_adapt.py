@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from deep_io import DeepSamples, Window
 from model import zoo
 from model.config import FAST
 from model.denoiser import Denoiser
-from pipelines.denoise import Job
+from pipelines.denoise import Job, denoise_frames
 from pipelines.options import DenoiseOptions
 from pipelines.plan import FramePlan
 from tests.end_to_end.scenes import changed, noisy_scene, random_weights, rgb, write_scene
@@ -40,6 +41,28 @@ def test_layers_follow_the_scene(tmp_path: Path, hits: bool, choices: dict[str, 
     job = Job(DenoiseOptions(str(source), str(tmp_path / "out.exr"), model=str(weights), **choices))
     with job.open(source) as reader:
         assert job.plan(source, reader, lambda _: None).shot.layers == expected
+
+
+def test_what_is_kept_of_a_frame_holds_no_picture(tmp_path: Path) -> None:
+    """A report holds the plans of all frames of a job: pictures in them would be memory that grows."""
+    source = write_scene(tmp_path / "in.deep.exr", plane(False))
+    weights = random_weights(tmp_path / "w.safetensors")
+    options = DenoiseOptions(str(source), str(tmp_path / "out.exr"), model=str(weights), progress="none")
+    job = Job(options)
+    with job.open(source) as reader:
+        before = job.plan(source, reader, lambda _: None)
+    after = denoise_frames(options).values[0].plan
+    assert sum(array.size >= 16 * 16 for array in arrays(before)) >= 3
+    assert max(array.size for array in arrays(after)) < 16 * 16
+    assert after.lines() == before.lines()
+
+
+def arrays(part: object) -> list[np.ndarray]:
+    """All arrays in a dataclass and what it is made of."""
+    if isinstance(part, np.ndarray):
+        return [part]
+    inside = [getattr(part, field.name) for field in fields(part)] if is_dataclass(part) else []
+    return [array for one in inside for array in arrays(one)]
 
 
 def moving(motion: float, blur: float = 0.0, seed: int = 0, last: float | None = None) -> DeepSamples:

@@ -12,7 +12,7 @@ from pipelines import light
 from pipelines.inference import FrameLayers
 from pipelines.light import hold_light
 
-HEIGHT, WIDTH = 96, 144  # whole cells, so that the mirrored picture has the same ones
+HEIGHT, WIDTH = 96, 144
 NOTHING = np.zeros((HEIGHT, WIDTH), np.bool_)
 FloatArray = npt.NDArray[np.float32]
 
@@ -138,13 +138,23 @@ def test_the_unit_of_radiance_is_irrelevant(factor: float) -> None:
     np.testing.assert_allclose(other.color / np.float32(factor), one.color, rtol=1e-4)
 
 
-def test_a_mirrored_picture_gives_the_mirrored_result() -> None:
-    truth = _truth()
-    samples = _samples(truth, 0.3)
+@pytest.mark.parametrize(("height", "width"), [(96, 144), (93, 131), (90, 9), (1, 50)])
+def test_a_mirrored_picture_gives_the_mirrored_result(height: int, width: int) -> None:
+    truth = _truth()[:height, :width]
+    noise = np.where(np.arange(width) < width / 3, 0.02, 0.3).astype(np.float32)
+    samples, nothing = _samples(truth, noise), NOTHING[:height, :width]
     one, other = _layers(truth * 0.95), _layers(truth[::-1, ::-1] * 0.95)
-    hold_light(one, samples, NOTHING)
-    hold_light(other, samples[::-1, ::-1].copy(), NOTHING)
+    hold_light(one, samples, nothing)
+    hold_light(other, samples[::-1, ::-1].copy(), nothing)
     np.testing.assert_allclose(other.color[..., ::-1, ::-1], one.color, rtol=1e-5)
+
+
+@pytest.mark.parametrize("size", range(1, 60))
+def test_cells_cover_the_picture_and_are_alike_from_either_side(size: int) -> None:
+    edges = light._edges(size)
+    assert (edges[0], edges[-1]) == (0, size)
+    assert 0 < np.diff(edges).min() <= np.diff(edges).max() <= light.CELL + 1
+    np.testing.assert_array_equal(size - edges[::-1], edges)
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 2), (3, 2), (2, 1), (16, 700), (300, 1)])
