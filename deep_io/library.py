@@ -1,13 +1,16 @@
 """Pixels read by the OpenEXR library, whatever the attributes, the names and the path of the file are.
 
 The library gives up on a file for one attribute that its Python side does not know or cannot decode, and prints what
-goes wrong with pixels on standard output. So it gets a file in memory with bare headers, and its words as an exception.
+goes wrong with pixels on standard output and, below Python, on standard error. So it gets a file in memory with bare
+headers, and its words as an exception.
 """
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,6 +29,7 @@ _COPY_BYTES = 1 << 20
 _NO_MEMORY = ("memoryerror", "bad_alloc", "out_of_memory", "out of memory")
 # What the decoders of all threads take beside the pixels, rounded up: DWAB of many channels has chunks of megabytes.
 _DECODER_BYTES = 64 << 20
+_CORE = b"<python_buffer>: "  # how each line begins that the C core writes of a file in memory
 _one_at_a_time = threading.Lock()  # sys.stdout is everybody's.
 
 
@@ -42,7 +46,7 @@ def decode_with_library(stream: BytesIO, headers: FileHeaders, path: str) -> lis
     import OpenEXR  # 70 ms of start-up that the decoders of rows.py do not need.
 
     try:
-        with _said() as said, OpenEXR.File(stream, separate_channels=True) as opened:
+        with _said() as said, _core_silenced(), OpenEXR.File(stream, separate_channels=True) as opened:
             parts = [[channel.pixels for _, channel in sorted(part.channels.items())] for part in opened.parts]
     except Exception as error:  # RuntimeError, ValueError, UnicodeDecodeError, ZeroDivisionError ...: it has no family.
         if isinstance(error, MemoryError):
@@ -100,6 +104,26 @@ def _said() -> Iterator[list[str]]:
             yield listener.said
         finally:
             sys.stdout = stdout
+
+
+@contextmanager
+def _core_silenced() -> Iterator[None]:
+    """Keeps what the library's C core writes on file descriptor 2 from it; what others write meanwhile comes after."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # there is no standard error
+        yield
+        return
+    with tempfile.TemporaryFile() as heard:
+        os.dup2(heard.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            heard.seek(0)
+            others = [line for line in heard if not line.startswith(_CORE)]
+            os.write(kept, b"".join(others))
+            os.close(kept)
 
 
 class _Listener:

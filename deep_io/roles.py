@@ -62,7 +62,7 @@ class RoleSource:
         """In words, what has to be converted or known about the channels; "" where nothing has."""
         words = []
         if self.role == "normal":
-            words.append(f"{self.space} space" if self.space != WORLD else "world space, turned by the camera")
+            words.append(f"{self.space} space" if self.space != WORLD else "world space, to be turned by the camera")
         if self.role == "depth":
             words.append("ray length, made planar by the camera" if self.depth == DISTANCE else "planar")
         if self.zero_is_miss:

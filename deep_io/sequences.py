@@ -11,6 +11,7 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from fileseq.frameset import FrameSet
@@ -129,6 +130,14 @@ def expand(source: PathLike, frames: str | None = None) -> list[Frame]:
         listed = FrameSet([frame.number for frame in missing if frame.number is not None])
         raise InputError(f"{os.fspath(source)}: {len(missing)} of {len(found)} frames are missing: {listed}")
     return found
+
+
+def gaps(frames: Sequence[Frame]) -> str:
+    """The range of what is missing between the first frame and the last, at the least step of all; "" for nothing."""
+    numbers = sorted(frame.number for frame in frames if frame.number is not None)
+    step = min((after - before for before, after in pairwise(numbers)), default=1)
+    missing = set(range(numbers[0], numbers[-1], step)) - set(numbers) if numbers and step else set()
+    return str(FrameSet(sorted(missing))) if missing else ""
 
 
 def require_exr(target: PathLike) -> None:

@@ -308,6 +308,8 @@ def run_job(kind: type[Job], options: DenoiseOptions, frames: Sequence[sequences
         job.key = job.survey_of(key)  # all frames depend on it: what is wrong with it fails the job, once
     progress = make_progress(options.progress, len(frames))
     with progress:
+        if options.frames is None and (gaps := sequences.gaps(frames)):
+            progress.note(f"{options.source}: not on disk, and passed by: {gaps}; --frames makes it an error")
         return run_frames(frames, job.frame, progress, str, cure=LESS_MEMORY)
 
 
@@ -328,4 +330,4 @@ def tell_repairs(source: Path, repairs: dict[str, int], progress: Progress) -> N
     """One line on what was broken in the input: not finite, or too large to be true."""
     if repairs:
         listed = ", ".join(f"{count} {role}" for role, count in sorted(repairs.items()))
-        progress.note(f"{source}: broken values were mended: {listed}")
+        progress.note(f"{source}: broken values, not finite or too large, are left out or replaced: {listed}")

@@ -49,10 +49,13 @@ SEED_TOKEN = "@SEED@"
 MOST_IN_HALF = 16
 _BLOCK_SAMPLES = 1 << 20
 LIGHT = "_light"  # ends the name of a layer of light that is otherwise a role's
+ROUNDING = 2.0**-10  # by so much an alpha may leave 0..1 without being spoken of
+BEYOND = "alpha beyond 0..1"  # among the repairs
 OVERFLOW = "radiance overflow"  # among the repairs: radiance beyond half, stored as Inf
 _REPAIRED = {
     "depth": "whose depth is negative, not finite or too large, stored as unknown",
     "radiance": f"left out: their radiance is not finite, or beyond {LARGEST_RADIANCE:g}",
+    BEYOND: "of an alpha below 0 or above 1, stored as 0 or 1",
     OVERFLOW: f"of radiance stored as Inf, which in half is an overflow: read as {HALF_MAX:g}",
 }
 
@@ -344,4 +347,5 @@ class _Encoding:
         alpha = np.asarray(block.channels[self.mapping["coverage"].channels[0]], np.float32)
         broken = ~np.isfinite(alpha)
         repairs["coverage"] += int(np.count_nonzero(broken))
+        repairs[BEYOND] += int(np.count_nonzero(~broken & ((alpha < -ROUNDING) | (alpha > 1 + ROUNDING))))
         return np.clip(np.where(broken, 0, alpha), 0, 1).astype(np.float32)

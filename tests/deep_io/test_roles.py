@@ -160,7 +160,7 @@ def test_the_mapping_prints_a_line_for_every_role():
     text = "\n".join(lines)
     for role in ROLES:
         assert any(line.startswith(role) for line in lines)
-    assert "world space, turned by the camera" in text
+    assert "world space, to be turned by the camera" in text
     assert "motion     -- missing" in text
     assert "ViewLayer.Combined.A, 0 where the depth says miss" in text
 

@@ -8,8 +8,10 @@ import pytest
 
 from deep_io.errors import InputError, UsageError
 from deep_io.sequences import (
+    Frame,
     expand,
     frame_path,
+    gaps,
     has_pattern,
     is_sequence,
     pair,
@@ -44,6 +46,13 @@ def test_a_range_chooses_frames_with_a_step_and_each_once(shot):
 def test_missing_frames_are_all_listed(shot):
     with pytest.raises(InputError, match=r"shot\.####\.exr: 4 of 8 frames are missing: 1004,1006-1008$"):
         expand(shot / "shot.####.exr", "1001-1008")
+
+
+@pytest.mark.parametrize(("numbers", "missing"), [
+    ([1, 2, 3], ""), ([5], ""), ([1, 3, 5], ""), ([1, 2, 5], "3-4"), ([1, 3, 9, 7, 13], "5,11"), ([None], ""), ([], ""),
+])
+def test_gaps_are_frames_that_the_least_step_lacks(numbers, missing):
+    assert gaps([Frame(number, Path("in.exr")) for number in numbers]) == missing
 
 
 def test_outputs_take_their_own_pattern(shot):

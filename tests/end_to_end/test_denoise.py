@@ -92,6 +92,19 @@ def test_a_sequence_is_denoised_frame_by_frame(weights: Path, tmp_path: Path) ->
     assert "3 of 3 frames done" in run.err
 
 
+def test_a_gap_in_a_sequence_is_told_and_is_an_error_of_frames_that_are_named(weights: Path, tmp_path: Path) -> None:
+    for number in (1, 2, 4):
+        write_scene(tmp_path / f"in.{number:04d}.exr", noisy_scene(number, TINY))
+    words = ("denoise", tmp_path / "in.####.exr", tmp_path / "out.####.exr", "--model", weights)
+    run = in_process(*words, "--frames", "1-4")
+    assert run.code == 3
+    assert "1 of 4 frames are missing: 3" in run.err
+    run = in_process(*words)
+    assert run.code == 0
+    assert len(re.findall(r"^.*in\.####\.exr: not on disk, and passed by: 3;", run.err, re.MULTILINE)) == 1
+    assert "not on disk" not in in_process(*words, "--frames", "1-2,4", "--overwrite").err
+
+
 def test_a_frame_that_fails_does_not_stop_the_others_and_is_listed_at_the_end(weights: Path, tmp_path: Path) -> None:
     for number in (1, 2, 3):
         write_scene(tmp_path / f"in.{number:04d}.exr", noisy_scene(number, TINY))

@@ -202,6 +202,18 @@ def test_radiance_too_large_to_be_light_is_left_out_as_in_denoising(tmp_path):
     np.testing.assert_allclose(flat["key.B"][1, 1], 1.0, rtol=HALF)
 
 
+def test_alpha_beyond_its_range_is_clipped_and_told_but_for_rounding(tmp_path):
+    pictures = [render(seed) for seed in range(2)]
+    pictures[0]["A"][:2, 0] = 1.25, 1.0005
+    pictures[1]["A"][3, 3] = -0.5
+    out = tmp_path / "deep.exr"
+    report = pack(write_renders(tmp_path, pictures), out)
+    assert report is not None
+    assert f"{out}: 2 samples of an alpha below 0 or above 1, stored as 0 or 1" in report.lines()
+    expected = np.mean([np.clip(picture["A"], 0, 1) for picture in pictures], 0)
+    np.testing.assert_allclose(flatten(out)["A"], expected, atol=1e-6)
+
+
 def test_radiance_that_overflowed_half_is_kept_and_told_as_such(tmp_path):
     pictures = [render(seed) for seed in range(3)]
     pictures[0]["R"][4, 5] = pictures[1]["G"][2, 2] = np.inf

@@ -47,7 +47,7 @@ def test_the_bytes_do_not_depend_on_how_the_renders_are_stored_or_how_much_is_he
     assert times_over == (held < 10**9 and stored != "none")
 
 
-def test_pixels_that_are_damaged_at_the_end_leave_no_output(tmp_path):
+def test_pixels_that_are_damaged_at_the_end_leave_no_output(tmp_path, capfd):
     paths = write_renders(tmp_path, [render(seed) for seed in range(3)])
     write_flat(paths[1], {name: np.tile(values, (20, 1)) for name, values in render(1).items()})
     for seed in (0, 2):
@@ -57,6 +57,7 @@ def test_pixels_that_are_damaged_at_the_end_leave_no_output(tmp_path):
     paths[1].write_bytes(data)
     with pytest.raises(InputError, match=r"s1\.exr: the pixels are truncated or corrupt"):
         pack(paths, tmp_path / "deep.exr")
+    assert capfd.readouterr() == ("", "")
     assert sorted(os.listdir(tmp_path)) == [path.name for path in paths]
 
 
