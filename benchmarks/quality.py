@@ -74,7 +74,7 @@ def oidn_methods(oidn: Oidn) -> dict[str, Method]:
     }
 
 
-def lbmc_method(model: str, threads: int | None, adapt: bool, layers: int | None) -> Method:
+def lbmc_method(model: str, threads: int | None, adapt: bool, layers: int | None, light: bool = True) -> Method:
     """`lbmc denoise` with one preset or weight file, through the same door as the command."""
 
     def denoise(scene: Scene) -> Picture:
@@ -89,6 +89,7 @@ def lbmc_method(model: str, threads: int | None, adapt: bool, layers: int | None
                 threads=threads,
                 adapt=adapt,
                 layers=layers,
+                light=light,
                 pixel_type="float",
                 progress="none",
             )
@@ -130,6 +131,7 @@ def main() -> None:
     parser.add_argument("--no-oidn", action="store_true")
     parser.add_argument("--no-adapt", action="store_true")
     parser.add_argument("--layers", type=int)
+    parser.add_argument("--light", choices=("held", "free"), default="held")
     parser.add_argument("--flip", action="store_true", help="also FLIP (in the JSON)")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--json", type=Path)
@@ -146,7 +148,7 @@ def main() -> None:
         }
         for model in options.model:
             methods[f"lbmc {Path(model).stem}"] = lbmc_method(
-                model, options.threads, not options.no_adapt, options.layers
+                model, options.threads, not options.no_adapt, options.layers, options.light == "held"
             )
         results: dict[int, dict[str, dict[str, Scores]]] = {}
         seconds = dict.fromkeys(methods, 0.0)
