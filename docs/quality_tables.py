@@ -17,8 +17,8 @@ SETS = {"shared": "12 of another generator", "unseen": "20 of our own, unseen", 
 """docs/results/quality-NAME.json, and what the table calls it."""
 METHODS = {"noisy": "noisy", "baseline": "clamp and blur", "OIDN color": "OIDN colour",
            "OIDN aux": "OIDN + albedo, normal", "OIDN prefiltered": "OIDN prefiltered", "lbmc fast": "lbmc fast",
-           "lbmc best": "lbmc best"}
-MINE, YARDSTICK = ("lbmc fast", "lbmc best"), "OIDN aux"
+           "lbmc high": "lbmc high", "lbmc best": "lbmc best"}
+MINE, YARDSTICK = ("lbmc fast", "lbmc high", "lbmc best"), "OIDN aux"
 MANY = ".32spp"  # the same scenes as others of their set
 
 

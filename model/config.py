@@ -41,6 +41,11 @@ class UNetConfig:
         return self.head[-1] if self.head else self.decoder[-1][-1]
 
     @property
+    def widest(self) -> int:
+        """The most channels at its own resolution, where nearly all of its memory goes."""
+        return max(*self.encoder[0], *self.decoder[-1])
+
+    @property
     def stride(self) -> int:
         """Pictures are padded to a multiple of this many pixels."""
         return int(self.scale * 2 ** len(self.encoder))

@@ -21,7 +21,7 @@ SUFFIX = ".safetensors"
 METADATA_KEY = "lbmc"
 FORMAT = 1
 DEFAULT_PRESET = "fast"
-MIRRORED: Mapping[str, str] = MappingProxyType({"best": "fast"})
+MIRRORED: Mapping[str, str] = MappingProxyType({"best": "high"})
 """Presets without a file of their own: the preset whose weights run on the frame and its mirror images, averaged."""
 
 

@@ -128,7 +128,8 @@ def fit(reader: FrameReader, net: Denoiser, layers: int, memory: int, mirrored: 
     mirrored : whether mirror images of it are denoised as well
     beside : bytes that something else takes meanwhile
     """
-    load = FrameLoad(reader.header.data_window.width, reader.samples_per_row, layers, reader.carried, mirrored)
+    load = FrameLoad(reader.header.data_window.width, reader.samples_per_row, layers, reader.carried, mirrored,
+                     net.config.unet.widest)
 
     def planned(budget: int) -> tuple[list[Band], int]:
         bands = plan_bands(load, net.reach, net.tile_reach, net.stride, budget)

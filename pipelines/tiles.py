@@ -18,13 +18,14 @@ import numpy.typing as npt
 BYTES_BASE = 350 << 20  # the process with its libraries
 BYTES_PER_SAMPLE = 105  # decoded roles in float32, and what the network holds per sample
 BYTES_PER_MIRRORED = 40  # besides, of each sample where mirror images are denoised as well
-BYTES_PER_PIXEL = 450  # context
+BYTES_PER_CHANNEL = 7.0  # of each pixel and channel of the context's network
+BYTES_PER_MIRRORED_CHANNEL = 3.0  # besides, where mirror images are denoised: what one run leaves is not all free again
 BYTES_PER_LAYER = 1100  # of each pixel: planes and predictions
 BYTES_PER_CARRIED = (16, 64)  # for each channel filtered besides the radiance: of each sample, of each pixel and layer
 BYTES_OF_RESULT = 24  # of each pixel and layer of a frame, whatever its bands
 BYTES_OF_LIGHT = 8  # of each pixel of a frame: what the survey keeps of its light, and what is made of that
-BYTES_OF_CONTEXT = 80  # of each pixel of a frame whose bands share a context
-BYTES_TO_DECODE = 600  # the same while it is made, before the first band
+BYTES_OF_CONTEXT = 1.25  # of each pixel and channel of a frame whose bands share a context
+BYTES_TO_DECODE = 9.5  # the same while it is made, before the first band
 DEFAULT_MEMORY = 8 << 30
 CONTROL_GROUPS = {  # where a hierarchy of control groups is mounted: the file of a group that has its limit
     "sys/fs/cgroup": "memory.max",
@@ -50,6 +51,7 @@ class FrameLoad:
     samples : (height,) how many each row holds
     carried : channels filtered besides the radiance
     mirrored : whether mirror images of it are denoised as well
+    channels : the most of the network that makes the context, at its own resolution
     """
 
     width: int
@@ -57,6 +59,7 @@ class FrameLoad:
     layers: int
     carried: int = 0
     mirrored: bool = False
+    channels: int = 64
 
     @property
     def height(self) -> int:
@@ -72,7 +75,8 @@ class FrameLoad:
     def needed(self, rows: int) -> int:
         """Estimated peak bytes of denoising any so many rows at once."""
         per_sample, per_layer = BYTES_PER_CARRIED
-        pixel = BYTES_PER_PIXEL + self.layers * (BYTES_PER_LAYER + self.carried * per_layer)
+        channel = BYTES_PER_CHANNEL + self.mirrored * BYTES_PER_MIRRORED_CHANNEL
+        pixel = round(self.channels * channel) + self.layers * (BYTES_PER_LAYER + self.carried * per_layer)
         per_sample = BYTES_PER_SAMPLE + self.carried * per_sample + self.mirrored * BYTES_PER_MIRRORED
         samples = self.most_samples(rows) * per_sample
         result = self.height * self.width * (self.layers * BYTES_OF_RESULT + BYTES_OF_LIGHT)
@@ -81,11 +85,12 @@ class FrameLoad:
     @property
     def context(self) -> int:
         """Estimated bytes of a context that bands share."""
-        return self.height * self.width * BYTES_OF_CONTEXT
+        return round(self.height * self.width * self.channels * BYTES_OF_CONTEXT)
 
     def needed_shared(self, rows: int) -> int:
         """`needed` where bands share a context."""
-        return max(self.needed(rows) + self.context, BYTES_BASE + self.height * self.width * BYTES_TO_DECODE)
+        decoded = round(self.height * self.width * self.channels * BYTES_TO_DECODE)
+        return max(self.needed(rows) + self.context, BYTES_BASE + decoded)
 
 
 def default_memory(root: Path = Path("/")) -> int:

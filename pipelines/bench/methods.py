@@ -27,7 +27,7 @@ from model.atrous import atrous, bounded_depth
 from model.baseline import clamp_and_blur, pixel_means
 from model.config import LAYER, LAYER_W, OPTIMIZED, PIXEL_GATHER, SAMPLE_SPLAT, Config
 from model.denoiser import Denoiser
-from model.weight_files import DEFAULT_PRESET
+from model.weight_files import DEFAULT_PRESET, MIRRORED
 from pipelines.bench.clock import Clock
 from pipelines.denoise import Job
 from pipelines.frame_reader import FrameReader
@@ -265,8 +265,8 @@ def watch_network(clock: Clock, net: Denoiser) -> None:
 
 
 def shipped() -> tuple[str, ...]:
-    """The presets that ship, the default one first."""
-    return tuple(sorted(zoo.presets(), key=lambda name: name != DEFAULT_PRESET))
+    """The presets that ship, the default one first, those that run the weights of another last."""
+    return tuple(sorted(zoo.presets(), key=lambda name: (name != DEFAULT_PRESET, name in MIRRORED)))
 
 
 def method_specs(models: tuple[str, ...], oidn: bool, paper: bool) -> list[MethodSpec]:

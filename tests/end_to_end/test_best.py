@@ -27,9 +27,9 @@ FIXED = ("--exposure", "1", "--no-adapt", "--pixel-type", "float", "--threads", 
 
 @pytest.fixture(autouse=True)
 def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A random network in the place of `fast`, in this process."""
+    """A random network in the place of `high`, in this process."""
     (tmp_path / "presets").mkdir()
-    random_weights(tmp_path / "presets" / "fast.safetensors")
+    random_weights(tmp_path / "presets" / "high.safetensors")
     monkeypatch.setattr(weight_files, "WEIGHTS", tmp_path / "presets")
 
 
@@ -76,13 +76,13 @@ def test_what_is_mirrored_comes_out_mirrored(axis: int, more: tuple[str, ...], t
     there = mirrored(samples, axis)
     best = [denoised(tmp_path, name, one, "best", *more) for name, one in (("a", samples), ("b", there))]
     assert difference(best[0], np.flip(best[1], axis)) < 1e-5
-    fast = [denoised(tmp_path, name, one, "fast", *more) for name, one in (("a", samples), ("b", there))]
-    assert difference(fast[0], np.flip(fast[1], axis)) > 1e-3
+    high = [denoised(tmp_path, name, one, "high", *more) for name, one in (("a", samples), ("b", there))]
+    assert difference(high[0], np.flip(high[1], axis)) > 1e-3
 
 
 def test_it_is_the_mean_of_the_mirror_images(tmp_path: Path) -> None:
     samples = scene(1)
-    runs = [np.flip(denoised(tmp_path, f"run{number}", image, "fast"), axes) for number, (image, axes) in enumerate((
+    runs = [np.flip(denoised(tmp_path, f"run{number}", image, "high"), axes) for number, (image, axes) in enumerate((
         (samples, ()), (mirrored(samples, 0), (0,)), (mirrored(samples, 1), (1,)),
         (mirrored(mirrored(samples, 0), 1), (0, 1))))]
     assert difference(denoised(tmp_path, "mean", samples, "best"), np.mean(runs, axis=0)) < 1e-5
@@ -151,30 +151,30 @@ def test_shares_of_samples_are_averaged_whatever_the_bands(tmp_path: Path) -> No
 def test_exported_layers_and_a_dry_run_say_best(tmp_path: Path) -> None:
     source = write_scene(tmp_path / "in.exr", scene(5))
     dry = in_process("denoise", source, tmp_path / "no.exr", "--model", "best", "--dry-run")
-    assert "model: best, the mean of 4 runs of fast" in dry.out
+    assert "model: best, the mean of 4 runs of high" in dry.out
     run = in_process("export-layers", source, tmp_path / "deep.exr", "--model", "best")
     assert run.code == 0, run.err
     (header,) = read_headers(tmp_path / "deep.exr")
     assert header.get("lbmc:model") == "best"
-    assert header.get("lbmc:weights") == zoo.find("fast").digest
+    assert header.get("lbmc:weights") == zoo.find("high").digest
 
 
 def test_it_is_a_preset_by_the_weights_of_another() -> None:
-    best, fast = zoo.find("best"), zoo.find("fast")
-    assert (best.name, best.mirrored, fast.mirrored) == ("best", True, False)
-    assert (best.path, best.digest) == (fast.path, fast.digest)
-    assert zoo.presets() == ["best", "fast"]
+    best, high = zoo.find("best"), zoo.find("high")
+    assert (best.name, best.mirrored, high.mirrored) == ("best", True, False)
+    assert (best.path, best.digest) == (high.path, high.digest)
+    assert zoo.presets() == ["best", "high"]
     found = {preset["name"]: preset for preset in json.loads(in_process("models", "--json").out)}
-    assert found["best"]["weights"] == "fast"
+    assert found["best"]["weights"] == "high"
     assert found["best"]["mirrored"]
-    assert not found["fast"]["mirrored"]
+    assert not found["high"]["mirrored"]
 
 
 def test_training_from_it_starts_with_the_weights_that_it_runs() -> None:
-    config = zoo.find("fast").config
-    best, fast = (starting_weights(Path(name), config) for name in ("best", "fast"))
-    assert best.keys() == fast.keys()
-    assert all(torch.equal(best[name], fast[name]) for name in fast)
+    config = zoo.find("high").config
+    best, high = (starting_weights(Path(name), config) for name in ("best", "high"))
+    assert best.keys() == high.keys()
+    assert all(torch.equal(best[name], high[name]) for name in high)
 
 
 def test_without_the_weights_there_is_no_such_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,8 +188,9 @@ def test_the_shipped_preset_denoises_an_example(tmp_path: Path) -> None:
     run = installed("denoise", EXAMPLE, tmp_path / "best.exr", "--progress", "none", env={"LBMC_MODEL": "best",
                                                                                         "LBMC_THREADS": "1"})
     assert run.code == 0, run.err
-    plain = installed("denoise", EXAMPLE, tmp_path / "fast.exr", "--threads", "1", "--progress", "none")
+    plain = installed("denoise", EXAMPLE, tmp_path / "high.exr", "--model", "high", "--threads", "1", "--progress",
+                      "none")
     assert plain.code == 0, plain.err
     assert read_flat(tmp_path / "best.exr")[1]["lbmc:model"] == "best"
-    best, fast = rgb(tmp_path / "best.exr").astype(np.float64), rgb(tmp_path / "fast.exr").astype(np.float64)
-    assert 0 < np.abs(best - fast).mean() < 0.05 * fast.mean()
+    best, high = rgb(tmp_path / "best.exr").astype(np.float64), rgb(tmp_path / "high.exr").astype(np.float64)
+    assert 0 < np.abs(best - high).mean() < 0.05 * high.mean()
