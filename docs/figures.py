@@ -50,6 +50,12 @@ REDUCED = {
 """Markers and colours of paper.png; LAYER of other numbers of layers is on its line."""
 
 
+LABELS = ((8, 6), (4, -17), (8, 22), (4, -30))
+"""Where a label stands from its point, and where if one, two or three neighbours on the left have labels; points."""
+NEAR = (3.0, 1.3)
+"""Points that differ by less than these factors, in time and in error, are neighbours."""
+
+
 def load(path: Path) -> Results:
     """What `lbmc bench` wrote."""
     return Results.from_dict(json.loads(path.read_text("utf-8")))
@@ -70,14 +76,24 @@ def speed(results: Results) -> Figure:
     for name, (seconds, error) in points.items():
         look = looks[name]
         axes.plot(seconds, error, MARKERS[look.shape], color=look.color, ms=9, zorder=3)
-        axes.annotate(name, (seconds, error), xytext=(8, 6), textcoords="offset points", fontsize=9)
+        axes.annotate(name, (seconds, error), xytext=LABELS[crowded(points, name) % len(LABELS)],
+                      textcoords="offset points", fontsize=9)
     _log_axes(axes, "CPU seconds at 1920 x 1080 (one thread)" if results.machine["threads"] == 1 else
               "CPU seconds at 1920 x 1080", "relMSE")
     axes.set_xlim(right=max(x for x, _ in points.values()) * 2.5)
+    axes.set_ylim(bottom=min(y for _, y in points.values()) / 1.5)
     count = len(results.scenes_of(samples))
     axes.set_title(f"Time against error: {count} scenes, {samples} samples per pixel", fontsize=11, loc="left")
     axes.legend(frameon=False, fontsize=9, loc="center right")
     return figure
+
+
+def crowded(points: Mapping[str, tuple[float, float]], name: str) -> int:
+    """How many neighbours in a row stand so close to the left that their labels would cover that of `name`."""
+    x, y = points[name]
+    left = [(other, at) for other, at in points.items()
+            if at[0] < x < NEAR[0] * at[0] and max(at[1], y) < NEAR[1] * min(at[1], y)]
+    return 1 + max(crowded(points, other) for other, _ in left) if left else 0
 
 
 def growth(results: Results) -> Figure:
