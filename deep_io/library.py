@@ -8,12 +8,13 @@ headers, and its words as an exception.
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from io import BytesIO
 from typing import Any, BinaryIO
 
@@ -29,7 +30,7 @@ _COPY_BYTES = 1 << 20
 _NO_MEMORY = ("memoryerror", "bad_alloc", "out_of_memory", "out of memory")
 # What the decoders of all threads take beside the pixels, rounded up: DWAB of many channels has chunks of megabytes.
 _DECODER_BYTES = 64 << 20
-_CORE = b"<python_buffer>: "  # how each line begins that the C core writes of a file in memory
+_CORE = re.compile(rb"<python_buffer>: .*\n?")  # what the C core writes of a file in memory
 _one_at_a_time = threading.Lock()  # sys.stdout is everybody's.
 
 
@@ -109,21 +110,25 @@ def _said() -> Iterator[list[str]]:
 @contextmanager
 def _core_silenced() -> Iterator[None]:
     """Keeps what the library's C core writes on file descriptor 2 from it; what others write meanwhile comes after."""
-    try:
-        kept = os.dup(2)
-    except OSError:  # there is no standard error
-        yield
-        return
-    with tempfile.TemporaryFile() as heard:
+    with ExitStack() as stack:
+        try:
+            heard = stack.enter_context(tempfile.TemporaryFile())
+            kept = os.dup(2)
+        except OSError:  # no place for a temporary file, or no standard error: then the core speaks, or none hears it
+            heard = None
+        if heard is None:
+            yield
+            return
+        stack.callback(os.close, kept)
         os.dup2(heard.fileno(), 2)
         try:
             yield
         finally:
             os.dup2(kept, 2)
             heard.seek(0)
-            others = [line for line in heard if not line.startswith(_CORE)]
-            os.write(kept, b"".join(others))
-            os.close(kept)
+            others = b"".join(_CORE.sub(b"", line) for line in heard)
+            with suppress(OSError), open(kept, "wb", closefd=False) as stderr:
+                stderr.write(others)
 
 
 class _Listener:

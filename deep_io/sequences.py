@@ -134,10 +134,14 @@ def expand(source: PathLike, frames: str | None = None) -> list[Frame]:
 
 def gaps(frames: Sequence[Frame]) -> str:
     """The range of what is missing between the first frame and the last, at the least step of all; "" for nothing."""
-    numbers = sorted(frame.number for frame in frames if frame.number is not None)
+    numbers = sorted({frame.number for frame in frames if frame.number is not None})
     step = min((after - before for before, after in pairwise(numbers)), default=1)
-    missing = set(range(numbers[0], numbers[-1], step)) - set(numbers) if numbers and step else set()
-    return str(FrameSet(sorted(missing))) if missing else ""
+    found = []
+    for before, after in pairwise(numbers):
+        first, last = before + step, before + (after - before - 1) // step * step
+        if first <= last:
+            found.append(str(first) if first == last else f"{first}-{last}{f'x{step}' if step > 1 else ''}")
+    return ",".join(found)
 
 
 def require_exr(target: PathLike) -> None:

@@ -50,7 +50,7 @@ REDUCED = {
 """Markers and colours of paper.png; LAYER of other numbers of layers is on its line."""
 
 
-LABELS = ((8, 6), (4, -17), (8, 22), (4, -30))
+LABELS = ((8, 8), (-20, -24), (14, 26), (4, -36))
 """Where a label stands from its point, and where if one, two or three neighbours on the left have labels; points."""
 NEAR = (3.0, 1.3)
 """Points that differ by less than these factors, in time and in error, are neighbours."""
@@ -77,7 +77,8 @@ def speed(results: Results) -> Figure:
         look = looks[name]
         axes.plot(seconds, error, MARKERS[look.shape], color=look.color, ms=9, zorder=3)
         axes.annotate(name, (seconds, error), xytext=LABELS[crowded(points, name) % len(LABELS)],
-                      textcoords="offset points", fontsize=9)
+                      textcoords="offset points", fontsize=9, arrowprops={"arrowstyle": "-", "color": PLAIN.color,
+                                                                          "lw": 0.6, "shrinkB": 5})
     _log_axes(axes, "CPU seconds at 1920 x 1080 (one thread)" if results.machine["threads"] == 1 else
               "CPU seconds at 1920 x 1080", "relMSE")
     axes.set_xlim(right=max(x for x, _ in points.values()) * 2.5)

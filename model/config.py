@@ -42,7 +42,7 @@ class UNetConfig:
 
     @property
     def widest(self) -> int:
-        """The most channels at its own resolution, where nearly all of its memory goes."""
+        """The most channels at its own resolution: a yardstick of the memory it takes."""
         return max(*self.encoder[0], *self.decoder[-1])
 
     @property

@@ -44,7 +44,7 @@ class LossWeights:
     darkness: Annotated[
         float, "share of a crop's light that is lost, less what is won, against terms that would rather be too dark: "
                "linear up to twice the reference. What is brighter than four times the mean counts as just that: "
-               "making lamps larger would pay, else"
+               "otherwise making lamps larger would pay"
     ] = 0.0
     noise2noise: Annotated[
         float, "squared error relative to the prediction, (d - y)^2 / (d^2 + 0.01), uncut: safe for noisy references"

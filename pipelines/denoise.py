@@ -308,8 +308,9 @@ def run_job(kind: type[Job], options: DenoiseOptions, frames: Sequence[sequences
         job.key = job.survey_of(key)  # all frames depend on it: what is wrong with it fails the job, once
     progress = make_progress(options.progress, len(frames))
     with progress:
-        if options.frames is None and (gaps := sequences.gaps(frames)):
-            progress.note(f"{options.source}: not on disk, and passed by: {gaps}; --frames makes it an error")
+        if options.frames is None and (gaps := sequences.gaps(frames)) and not sequences.has_range(options.source):
+            progress.note(f"{options.source}: frames not on disk, skipped: {gaps} (name them with --frames to make "
+                          f"this an error)")
         return run_frames(frames, job.frame, progress, str, cure=LESS_MEMORY)
 
 

@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,13 +16,13 @@ import OpenEXR
 import OpenImageIO as oiio
 import pytest
 
-from deep_io import DeepReader, Window
+from deep_io import DeepReader, Window, library
 from deep_io.attributes import Attribute
 from deep_io.chunks import chunk_count
 from deep_io.errors import InputError
 from deep_io.flat import FlatImage, read_flat, read_flat_parts, write_flat, write_flat_parts
 from deep_io.header import Header, parse_headers, read_headers
-from deep_io.library import _said
+from deep_io.library import _core_silenced, _said
 from deep_io.reheading import read_chunk_table, reheaded
 from tests.deep_io.deep_files import openexr_part, random_samples, write_openexr
 
@@ -156,7 +157,7 @@ def test_what_the_library_says_of_damaged_pixels_is_in_the_error_and_not_printed
     path.write_bytes(data)
     with pytest.raises(InputError, match=r"flat\.exr: the pixels are [^\n]* \(OpenEXR: Unable to [^\n]*\)$"):
         read_flat(path)
-    assert capfd.readouterr().out == ""
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_truncated_file_is_told_without_the_library(tmp_path, capfd):
@@ -166,6 +167,28 @@ def test_a_truncated_file_is_told_without_the_library(tmp_path, capfd):
     with pytest.raises(InputError, match="they run past the end of the file"):
         read_flat(path)
     assert capfd.readouterr() == ("", "")
+
+
+def test_what_others_say_on_standard_error_comes_after_the_core_is_silenced(capfd):
+    with suppress(KeyError), _core_silenced():
+        os.write(2, b"50 %<python_buffer>: (EXR_ERR) of the core\n<python_buffer>: and more\ntheirs\n")
+        raise KeyError
+    assert capfd.readouterr().err == "50 %theirs\n"
+    os.write(2, b"after\n")
+    assert capfd.readouterr().err == "after\n"
+
+
+@pytest.mark.parametrize("missing", ["a place for temporary files", "standard error"])
+def test_nothing_is_silenced_where_that_cannot_be(missing, monkeypatch, capfd):
+    def fail(*_: object) -> int:
+        raise OSError(missing)
+
+    name = "TemporaryFile" if missing != "standard error" else "dup"
+    monkeypatch.setattr(library.tempfile if name == "TemporaryFile" else library.os, name, fail)
+    with _core_silenced():
+        os.write(2, b"said\n")
+    monkeypatch.undo()
+    assert capfd.readouterr().err == "said\n"
 
 
 def test_other_threads_print_while_the_library_is_listened_to(capsys):

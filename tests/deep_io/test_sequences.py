@@ -50,6 +50,7 @@ def test_missing_frames_are_all_listed(shot):
 
 @pytest.mark.parametrize(("numbers", "missing"), [
     ([1, 2, 3], ""), ([5], ""), ([1, 3, 5], ""), ([1, 2, 5], "3-4"), ([1, 3, 9, 7, 13], "5,11"), ([None], ""), ([], ""),
+    ([0, 10, 40], "20-30x10"), ([1, 2, 10**12], f"3-{10**12 - 1}"), ([1, 1, 5], ""), ([1, 4, 9], "7"),
 ])
 def test_gaps_are_frames_that_the_least_step_lacks(numbers, missing):
     assert gaps([Frame(number, Path("in.exr")) for number in numbers]) == missing

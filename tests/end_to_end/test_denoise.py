@@ -101,7 +101,7 @@ def test_a_gap_in_a_sequence_is_told_and_is_an_error_of_frames_that_are_named(we
     assert "1 of 4 frames are missing: 3" in run.err
     run = in_process(*words)
     assert run.code == 0
-    assert len(re.findall(r"^.*in\.####\.exr: not on disk, and passed by: 3;", run.err, re.MULTILINE)) == 1
+    assert len(re.findall(r"^.*in\.####\.exr: frames not on disk, skipped: 3 ", run.err, re.MULTILINE)) == 1
     assert "not on disk" not in in_process(*words, "--frames", "1-2,4", "--overwrite").err
 
 

@@ -45,6 +45,15 @@ def test_one_band_when_the_budget_allows_it(height: int, width: int, per_pixel: 
     assert len(plan_bands(load, 100, 50, 32, load.needed(height))) == 1
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_wider_network_needs_more_for_each_pixel_and_as_much_for_each_sample(mirrored: bool) -> None:
+    def needed(channels: int, per_pixel: int) -> int:
+        return FrameLoad(100, np.full(100, 100 * per_pixel), 2, mirrored=mirrored, channels=channels).needed(100)
+
+    wider = needed(128, 8) - needed(64, 8)
+    assert 100 * 100 * 64 * 4 < wider == needed(128, 2) - needed(64, 2)
+
+
 def tallest(bands: list[Band]) -> int:
     return max(band.read1 - band.read0 for band in bands)
 
