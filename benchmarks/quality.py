@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Quality on a folder of NAME.deep.exr + NAME.ref.exr: the noisy mean, an untrained baseline, Intel OIDN, and lbmc.
 
-    python benchmarks/quality.py FOLDER [--model fast] [--json OUT.json] [--panels DIR]
+    python benchmarks/quality.py FOLDER [--model fast] [--tune] [--json OUT.json] [--panels DIR]
 
 Prints one Markdown row per scene and method (relMSE / SMAPE / PSNR / energy), and for each number of samples per pixel
 the geometric mean of relMSE and the means of the others. Errors are those of model/metrics.py; where NAME.ref2.exr is
@@ -100,6 +100,23 @@ def lbmc_method(model: str, threads: int | None, adapt: bool, layers: int | None
     return denoise
 
 
+def tuned_method(model: str, threads: int | None, adapt: bool, layers: int | None, light: bool) -> Method:
+    """`lbmc tune` to the scene, then `lbmc denoise` with what it wrote; the scene's reference has no part in it."""
+
+    def denoise(scene: Scene) -> Picture:
+        from pipelines.tuning.job import tune
+        from pipelines.tuning.options import TuneOptions
+
+        with tempfile.TemporaryDirectory() as folder:
+            weights = str(Path(folder) / "scene.safetensors")
+            reading = DenoiseOptions(str(scene.path), weights, model=model, threads=threads, adapt=adapt, layers=layers,
+                                     progress="none")
+            tune(TuneOptions(reading, progress="none"))
+            return lbmc_method(weights, threads, adapt, layers, light)(scene)
+
+    return denoise
+
+
 def cells(scores: Scores) -> str:
     return f"{scores.relmse:.4f} / {scores.smape:.4f} / {scores.psnr:.2f} / {scores.energy:.3f}"
 
@@ -132,12 +149,16 @@ def main() -> None:
     parser.add_argument("--no-adapt", action="store_true")
     parser.add_argument("--layers", type=int)
     parser.add_argument("--light", choices=("held", "free"), default="held")
+    parser.add_argument("--tune", action="store_true", help="also each model tuned to each scene by its own samples")
     parser.add_argument("--flip", action="store_true", help="also FLIP (in the JSON)")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--panels", type=Path, help="folder for one PNG per scene")
     options = parser.parse_args()
 
+    from pipelines.allocator import keep_freed_memory
+
+    keep_freed_memory()  # as the command does
     with Oidn(options.threads) as oidn:
         methods: dict[str, Method] = {
             "noisy": lambda scene: scene.mean("radiance"),
@@ -147,9 +168,10 @@ def main() -> None:
             **({} if options.no_oidn else oidn_methods(oidn)),
         }
         for model in options.model:
-            methods[f"lbmc {Path(model).stem}"] = lbmc_method(
-                model, options.threads, not options.no_adapt, options.layers, options.light == "held"
-            )
+            choices = (options.threads, not options.no_adapt, options.layers, options.light == "held")
+            methods[f"lbmc {Path(model).stem}"] = lbmc_method(model, *choices)
+            if options.tune:
+                methods[f"lbmc {Path(model).stem} tuned"] = tuned_method(model, *choices)
         results: dict[int, dict[str, dict[str, Scores]]] = {}
         seconds = dict.fromkeys(methods, 0.0)
         for truth in find_scenes(options.folder, options.match):

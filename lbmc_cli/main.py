@@ -28,6 +28,7 @@ COMMANDS = {
     "bench": "Measure speed against error on a folder of scenes, beside other denoisers.",
     "render": "Render training scenes with Mitsuba: deep samples and references.",
     "train": "Train a network on deep sample files with references.",
+    "tune": "Fit weights to a shot by its own samples, without a reference.",
     "models": "List the weights that are here.",
 }
 """Subcommands in the order of `--help`; each lives in lbmc_cli/NAME.py as a click command of that name."""

@@ -123,6 +123,28 @@ def smoothed(picture: Tensor) -> Tensor:
     return sums / weights
 
 
+def held_error(prediction: Tensor, held: Tensor, variance: Tensor, known: Tensor) -> Tensor:
+    """Mean of (d - y)^2 / (stopgrad(d)^2 + 0.01 + variance) over the known pixels, a scalar.
+
+    y are means of a few samples that the prediction was not made of, `variance` (B, 3, H, W) that of these means: where
+    they are so noisy that they tell nothing, they count for little. known (B, 1, H, W) bool. 0 if none is.
+
+    The minimum is the clean picture as far as the variance is not told by y itself; else it is darker.
+    """
+    error = (prediction - held).square() / (prediction.detach().square() + EPSILON + variance)
+    return (error * known).sum() / (3 * known.sum().clamp_min(1))
+
+
+def drift(prediction: Tensor, start: Tensor, variance: Tensor) -> Tensor:
+    """Mean of (d - s)^2 / (s^2 + 0.01), where the samples are so noisy that they tell nothing, a scalar.
+
+    s is what the network made of all samples before it was changed. Weighted by variance / (s^2 + 0.01 + variance),
+    what `held_error` leaves uncounted.
+    """
+    size = start.square() + EPSILON
+    return ((prediction - start).square() / size * (variance / (size + variance))).mean()
+
+
 def tone_map(picture: Tensor) -> Tensor:
     """sRGB transfer function of log(1 + max(x, 0)), not clamped above."""
     y = torch.log1p(picture.clamp_min(0))

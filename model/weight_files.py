@@ -23,6 +23,8 @@ FORMAT = 1
 DEFAULT_PRESET = "fast"
 MIRRORED: Mapping[str, str] = MappingProxyType({"best": "high"})
 """Presets without a file of their own: the preset whose weights run on the frame and its mirror images, averaged."""
+MIRRORED_KEY = "mirrored"
+"""Of a file's "info": whether these weights, tuned from those of such a preset, run so as well."""
 
 
 def presets() -> list[str]:

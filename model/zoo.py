@@ -21,6 +21,7 @@ from model.weight_files import (
     FORMAT,
     METADATA_KEY,
     MIRRORED,
+    MIRRORED_KEY,
     SUFFIX,
     digest_of,
     presets,
@@ -76,7 +77,7 @@ def find(name: str | None = None) -> Weights:
     config, info = Config.from_dict(document["config"]), document["info"]
     if name is not None and name in MIRRORED:
         return Weights(name, path, config, info, mirrored=True)
-    return Weights(path.stem, path, config, info)
+    return Weights(path.stem, path, config, info, mirrored=bool(info.get(MIRRORED_KEY)))
 
 
 def list_models() -> list[Weights]:

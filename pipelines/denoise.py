@@ -165,6 +165,12 @@ class Job:
                 return self.survey_of(earlier)
         return seen
 
+    def decide_by(self, source: Path | None) -> None:
+        """Makes a frame, if any is named, decide for the shot. All frames depend on it: what is wrong with it fails the
+        job, once."""
+        if source is not None:
+            self.key = self.survey_of(source)
+
     def survey_of(self, source: Path) -> Survey:
         """What another frame of the shot is like. Raises LbmcError, also for a frame that says nothing of the shot."""
         with self.open(source) as reader:
@@ -304,8 +310,8 @@ def run_job(kind: type[Job], options: DenoiseOptions, frames: Sequence[sequences
         for frame in frames:  # a refused output is found before hours of work, not after
             for target in job.targets(frame):
                 to_do |= output_action(target, inputs, options.existing)
-    if to_do and (key := exposure_frame(options)) is not None:
-        job.key = job.survey_of(key)  # all frames depend on it: what is wrong with it fails the job, once
+    if to_do:
+        job.decide_by(exposure_frame(options))
     progress = make_progress(options.progress, len(frames))
     with progress:
         if options.frames is None and (gaps := sequences.gaps(frames)) and not sequences.has_range(options.source):

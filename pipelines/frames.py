@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from deep_io.errors import InputError, UsageError
-from deep_io.sequences import Frame, frame_path, is_sequence, pair, sibling_path
+from deep_io.sequences import Frame, expand, frame_path, is_sequence, pair, sibling_path
 from pipelines.options import DenoiseOptions
 
 
@@ -17,6 +17,13 @@ def find_frames(options: DenoiseOptions) -> list[Frame]:
     there.
     """
     frames = pair(options.source, options.target, options.frames)
+    exposure_frame(options)
+    return frames
+
+
+def find_sources(options: DenoiseOptions) -> list[Frame]:
+    """The frames of a job that writes none. Raises what deep_io.sequences.expand does, and as `find_frames`."""
+    frames = expand(options.source, options.frames)
     exposure_frame(options)
     return frames
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from model import losses
 from model.losses import LossWeights, smape, smoothed, tone_mapped, total_loss
 
 
@@ -149,3 +150,39 @@ def test_darkness_is_the_share_of_light_that_is_lost_with_one_slope_up_to_twice_
     assert float(total_loss(2 * lamp, lamp, weights)) > -1
     red = picture(0.4) * torch.tensor([1.0, 0.0, 0.0])[:, None, None]
     assert float(total_loss(picture(0.3), red, weights)) == pytest.approx(0.25 / 3)
+
+
+def test_held_error_is_least_at_the_clean_picture_whatever_the_noise() -> None:
+    torch.manual_seed(0)
+    clean = torch.rand(1, 3, 64, 64, dtype=torch.float64) + 0.5
+    noise = torch.randn(1, 3, 64, 64, dtype=torch.float64)
+    known = torch.ones(1, 1, 64, 64, dtype=torch.bool)
+    slopes = []
+    for factor in (0.9, 1.0, 1.1):
+        gain = torch.tensor(factor, dtype=torch.float64, requires_grad=True)
+        losses.held_error(clean * gain, clean + noise, torch.ones_like(clean), known).backward()
+        assert gain.grad is not None
+        slopes.append(float(gain.grad))
+    assert slopes[0] < -0.03
+    assert abs(slopes[1]) < 0.02
+    assert slopes[2] > 0.03
+
+
+def test_held_error_counts_known_pixels_alone_and_noisy_ones_little() -> None:
+    prediction, held = torch.ones(1, 3, 4, 4), torch.full((1, 3, 4, 4), 2.0)
+    known = torch.ones(1, 1, 4, 4, dtype=torch.bool)
+    plain = losses.held_error(prediction, held, torch.zeros_like(held), known)
+    assert float(plain) == pytest.approx(1 / 1.01)
+    held[..., 0] = 1e6
+    known[..., 0] = False
+    assert float(losses.held_error(prediction, held, torch.zeros_like(held), known)) == pytest.approx(1 / 1.01)
+    noisy = losses.held_error(prediction, held, torch.full_like(held, 98.99), known)
+    assert float(noisy) == pytest.approx(0.01)
+
+
+def test_drift_counts_where_the_samples_tell_nothing() -> None:
+    start = torch.ones(1, 3, 4, 4)
+    moved = start * 1.1
+    assert float(losses.drift(moved, start, torch.zeros_like(start))) == 0
+    assert float(losses.drift(moved, start, torch.full_like(start, 1e6))) == pytest.approx(0.01 / 1.01, rel=1e-4)
+    assert float(losses.drift(start, start, torch.ones_like(start))) == 0

@@ -1,0 +1,1 @@
+"""Tuning: weights fitted to a shot by its own samples, without a reference."""
