@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +21,7 @@ from tests.end_to_end.scenes import (
     without_samples,
     write_scene,
 )
-from tests.runner import Finished, Runner, in_process, installed
+from tests.runner import LBMC, Finished, Runner, environment, in_process, installed
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples/scenes"
 WINDOW = Window(-5, 3, 34, 34)
@@ -190,6 +192,23 @@ def test_one_sample_beyond_all_bounds_harms_nothing(tmp_path: Path, weights: Pat
     else:
         refused(run, 3, "in.exr", "went astray")
         assert not (tmp_path / "out.safetensors").exists()
+
+
+def test_a_signal_ends_it_between_two_steps_and_leaves_nothing(tmp_path: Path, weights: Path) -> None:
+    source = write_scene(tmp_path / "in.exr", noisy_scene(0, WINDOW))
+    command = [LBMC, "tune", source, tmp_path / "out.safetensors", "--model", weights, "--steps", "100000", "--threads",
+               "1", "--progress", "plain"]
+    with subprocess.Popen([*map(str, command)], stderr=subprocess.PIPE, text=True, env=environment()) as process:
+        assert process.stderr is not None
+        line = ""
+        while not line.startswith("Progress: 2"):  # the first fifth is reading
+            line = process.stderr.readline()
+            assert line, "it ended by itself"
+        process.send_signal(signal.SIGTERM)
+        rest = process.stderr.read()
+        assert process.wait(60) == 143, rest
+    assert not (tmp_path / "out.safetensors").exists()
+    assert not list(tmp_path.glob(".*"))
 
 
 def test_one_pixel_and_many_samples_are_enough(tmp_path: Path, weights: Path) -> None:

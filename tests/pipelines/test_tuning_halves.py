@@ -183,6 +183,19 @@ def test_a_cut_is_these_columns_and_its_own(tmp_path: Path) -> None:
     assert (whole.roles["radiance"] > 0).all()
 
 
+def test_what_points_somewhere_is_mirrored_with_the_picture(tmp_path: Path) -> None:
+    samples = numbered()
+    rng = np.random.default_rng(9)
+    names = ("N.X", "N.Y", "N.Z", "lens.X", "lens.Y", "motion.X", "motion.Y")
+    crop = crop_of(read(tmp_path, changed(samples, **{n: rng.normal(size=samples.total).astype(np.float32)
+                                                      for n in names})))
+    straight, turned = (crop.deal(np.random.default_rng(4), way).given for way in (STRAIGHT, Mirror(True, True)))
+    there = {red: index for index, red in enumerate(straight.roles["radiance"][:, 0].tolist())}
+    index = [there[red] for red in turned.roles["radiance"][:, 0].tolist()]
+    for role, signs in (("normal", (-1, -1, 1)), ("lens", (-1, -1)), ("motion", (-1, -1))):
+        np.testing.assert_array_equal(turned.roles[role], straight.roles[role][index] * np.array(signs, np.float32))
+
+
 def test_pixels_of_one_sample_are_given_and_not_known(tmp_path: Path) -> None:
     crop = crop_of(read(tmp_path, noisy_scene(6, WINDOW, most=1)))
     halves = crop.deal(np.random.default_rng(6), STRAIGHT)
