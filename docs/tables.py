@@ -24,6 +24,7 @@ from adapting_tables import ADAPTING_TABLES
 from paper_tables import PAPER_TABLES
 from quality_tables import QUALITY_TABLES
 from result_tables import RESULT_TABLES
+from tuning_tables import TUNING_TABLES
 
 from deep_io.aliases import ALIASES, CAMERA_Z_FORWARD, DISTANCE, NOT_A_ROLE, RENDERER_MARKS, VIEW, WORLD, Alias
 from deep_io.roles import ROLES
@@ -128,6 +129,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **ABLATION_TABLES,
     **ADAPTING_TABLES,
     **QUALITY_TABLES,
+    **TUNING_TABLES,
 }
 
 

@@ -61,19 +61,19 @@ class Crop:
 
     def __init__(self, samples: PathSamples, start: Floats, scale: float) -> None:
         self.scale = scale
-        self._samples, self._start = samples, start
+        self.samples, self.start = samples, start
         self._even = evenly_timed(samples)
         self._spread = self._variance()
 
     @property
     def size(self) -> tuple[int, int]:
         """Height and width."""
-        height, width = self._samples.counts.shape
+        height, width = self.samples.counts.shape
         return height, width
 
     def deal(self, rng: np.random.Generator, mirror: Mirror) -> Halves:
         """Two halves, drawn from `rng`; the odd sample of a pixel goes to those that are given."""
-        samples = self._samples
+        samples = self.samples
         held = self._held(rng)
         counts = samples.counts.reshape(-1) // 2
         some = counts > 0
@@ -81,14 +81,14 @@ class Crop:
         if held.any():
             means[some] = np.add.reduceat(self._radiance()[held], offsets_of(counts)[:-1][some]) / counts[some, None]
         variance = self._spread / np.maximum(counts, 1)[:, None]
-        planes = (means, variance, self._start.reshape(-1, 3), some[:, None])
+        planes = (means, variance, self.start.reshape(-1, 3), some[:, None])
         pictures = mirror.picture(np.concatenate(planes, 1, dtype=np.float32).reshape(*self.size, 10)).copy()
         mean, spread, start, known = torch.from_numpy(pictures).permute(2, 0, 1)[None].split([3, 3, 3, 1], 1)
         return Halves(mirror.turn(_kept(samples, ~held)), mean, spread, start, known > 0)
 
     def _held(self, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
         """(N,) which samples are held back: one of each pair."""
-        samples, counts = self._samples, self._samples.counts.reshape(-1)
+        samples, counts = self.samples, self.samples.counts.reshape(-1)
         key = rng.random(samples.total, np.float32)
         if self._even:  # of a miss the time is not known
             key = np.where(samples.coverage > 0, samples.roles["time"][:, 0], key)
@@ -101,7 +101,7 @@ class Crop:
 
     def _radiance(self) -> npt.NDArray[np.float64]:
         """(N, 3) in the common scale."""
-        scaled: npt.NDArray[np.float64] = self._samples.roles["radiance"].astype(np.float64) * self.scale
+        scaled: npt.NDArray[np.float64] = self.samples.roles["radiance"].astype(np.float64) * self.scale
         return np.clip(scaled, -BRIGHTEST, BRIGHTEST)
 
     def _variance(self) -> Floats:
@@ -111,13 +111,13 @@ class Crop:
         Relative, or a lamp's edge would hide what the dark beside it tells. To the network's picture, not to the
         samples' mean, or a firefly would be noise of its own size and tell as much as any other.
         """
-        counts, pixel = self._samples.counts.reshape(-1).astype(np.int64), pixels_of(self._samples.counts)
+        counts, pixel = self.samples.counts.reshape(-1).astype(np.int64), pixels_of(self.samples.counts)
         radiance, some = self._radiance(), counts > 1
         sums = np.stack([np.bincount(pixel, values, counts.size) for values in radiance.T], 1)
         apart = radiance - (sums / np.maximum(counts, 1)[:, None])[pixel]
         squares = np.stack([np.bincount(pixel, values, counts.size) for values in np.square(apart).T], 1)
         variance = squares * (some / np.maximum(counts - 1, 1))[:, None]
-        size = np.square(self._start.astype(np.float64)).reshape(-1, 3) + EPSILON
+        size = np.square(self.start.astype(np.float64)).reshape(-1, 3) + EPSILON
         planes = torch.from_numpy(np.concatenate([variance / size, some[:, None]], 1).reshape(*self.size, 4))
         near = F.avg_pool2d(planes.permute(2, 0, 1), NEAR, 1, NEAR // 2)
         told = near[3:] > 0

@@ -7,6 +7,7 @@ denoised, and held against the other half. No reference is needed, and none is u
 from __future__ import annotations
 
 import copy
+import math
 import os
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -43,8 +44,11 @@ SMALLEST_CROP = 32  # pixels
 MOST_SAMPLES = 1 << 23  # of all crops together; about 0.8 GB
 MOST_OF_A_CROP = 1 << 20  # samples; denoising them, forward and back, takes about 2.5 GB
 RATE, MOMENTUM = 1e-2, 0.9
+CLIP = 0.25  # of the gradient's norm, usually 0.05 to 0.3: one bright sample, held back from the dark, has 20
 AVERAGE = 0.9  # what the averaged weights, which are written, keep each step; less of the first ones
 STAY = 1.0  # how much `drift` counts
+CHECKED, LIGHT = 8, 0.03  # crops whose light is compared at the end, and how far its logarithm may be off
+SHARES = (1.0, 0.7, 0.5, 0.35, 0.25)  # of what was changed; the largest that keeps the light is written
 READING_SHARE = 0.2  # of the progress
 
 
@@ -86,10 +90,10 @@ def tune(options: TuneOptions, frames: Sequence[Frame] | None = None) -> Tuned |
         rng = np.random.default_rng(options.seed)
         places = _gather(job, _spread(sources, options.most_frames), rng, progress)
         steps = options.steps or steps_for(_area(places))
-        _descend(job, places, steps, rng, progress)
+        share = _keep(job, places, _descend(job, places, steps, rng, progress))
         frames_used = len({place.plan.source for place in places})
         made = {"from": job.weights.name, "weights": job.weights.digest, "frames": frames_used, "crops": len(places),
-                "steps": steps, "seed": options.seed}
+                "steps": steps, "seed": options.seed, "share": share}
         with atomic_output(target) as temporary:
             zoo.save(job.net.cpu(), temporary, _info(job.weights, os.path.basename(reading.source), made))
         progress.finish()
@@ -195,8 +199,9 @@ def _edges(size: int, side: int) -> list[int]:
     return [round(place) for place in np.linspace(0, max(size - side, 0), count)]
 
 
-def _descend(job: Job, places: Sequence[_Place], steps: int, rng: np.random.Generator, progress: Progress) -> None:
-    """Gradient descent on the network of the job.
+def _descend(job: Job, places: Sequence[_Place], steps: int, rng: np.random.Generator, progress: Progress
+             ) -> dict[str, torch.Tensor]:
+    """Gradient descent on the network of the job; returns the averaged weights.
 
     Plain, not Adam: a few steps on a few noisy crops may move weights only where the gradient is large for all of them.
     """
@@ -208,16 +213,41 @@ def _descend(job: Job, places: Sequence[_Place], steps: int, rng: np.random.Gene
         optimizer.zero_grad()
         for _ in range(batch):
             (_loss(job, places[next(order)], rng) / batch).backward()
-        optimizer.step()
+        norm = torch.nn.utils.clip_grad_norm_(net.parameters(), CLIP)
+        if bool(norm.isfinite()):
+            optimizer.step()
         kept = min(AVERAGE, (step + 1) / (step + 4))
         for name, values in net.state_dict().items():
             averaged[name].lerp_(values, 1 - kept)
         raise_if_stopped()
         progress.update(READING_SHARE + (1 - READING_SHARE) * (step + 1) / steps)
-    if not all(bool(values.half().isfinite().all()) for values in averaged.values()):
-        raise InputError(f"{places[0].plan.source}: tuning went astray, its samples are too wild to learn from; "
-                         f"denoise with {job.weights.name} as it is")
-    net.load_state_dict(averaged)
+    return averaged
+
+
+def _keep(job: Job, places: Sequence[_Place], found: dict[str, torch.Tensor]) -> float:
+    """Gives the network as much of what was found as keeps the light of the crops; returns how much, a share.
+
+    Light that few samples carry is the first thing that descent gives up. Raises InputError where no share will do.
+    """
+    start = job.weights.load().to(job.device).state_dict()
+    for share in SHARES:
+        state = {name: torch.lerp(values, found[name], share) for name, values in start.items()}
+        job.net.load_state_dict(state)
+        finite = all(bool(values.half().isfinite().all()) for values in state.values())
+        if finite and _changed_light(job, places) <= LIGHT:
+            return share
+    raise InputError(f"{places[0].plan.source}: tuning went astray, its samples are too wild to learn from; denoise "
+                     f"with {job.weights.name} as it is")
+
+
+def _changed_light(job: Job, places: Sequence[_Place]) -> float:
+    """|log| of the light of these crops over what it was at the start; infinite where it is not a number."""
+    places = places[:CHECKED]
+    light = [float(_start(job, place.plan, place.crop.samples).sum(dtype=np.float64)) * place.crop.scale
+             for place in places]
+    before = sum(float(place.crop.start.sum(dtype=np.float64)) for place in places)
+    ratio = sum(light) / before if before > 0 else math.nan
+    return abs(math.log(ratio)) if ratio > 0 else math.inf
 
 
 def _cycle(count: int, rng: np.random.Generator) -> Iterator[int]:

@@ -66,6 +66,7 @@ def test_a_sequence_is_looked_at_here_and_there(tmp_path: Path, weights: Path) -
     assert "frames: 3" in run.err
     found = zoo.find(str(tmp_path / "shot.safetensors"))
     assert found.info["tuned"]["frames"] == 3
+    assert 0 < found.info["tuned"]["share"] <= 1
     assert found.info["tuned"]["weights"] == zoo.find(str(weights)).digest
     assert found.info["description"] == "random, tuned to shot.####.exr"
     before, after = (zoo.find(str(path)).load().state_dict() for path in (weights, tmp_path / "shot.safetensors"))

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from deep_io import Window
+from deep_io.errors import InputError
+from pipelines.denoise import Job
 from pipelines.options import DenoiseOptions
-from pipelines.tuning.job import _edges, _spread
+from pipelines.progress import Progress
+from pipelines.tuning.job import LIGHT, SHARES, _changed_light, _edges, _gather, _keep, _spread
 from pipelines.tuning.options import TuneOptions, steps_for
+from tests.end_to_end.scenes import noisy_scene, random_weights, write_scene
 
 
 @pytest.mark.parametrize(("count", "most"), [(1, 8), (3, 8), (8, 8), (100, 8), (100, 1), (9, 8)])
@@ -43,3 +49,23 @@ def test_options_out_of_range_are_refused() -> None:
     for target in ("out.exr", "out.####.safetensors"):
         with pytest.raises(ValueError, match=target):
             TuneOptions(DenoiseOptions("in.exr", target))
+
+
+def test_only_so_much_is_kept_as_leaves_the_light(tmp_path: Path) -> None:
+    source = write_scene(tmp_path / "in.exr", noisy_scene(0, Window(0, 0, 39, 31), most=8))
+    weights = random_weights(tmp_path / "random.safetensors")
+    job = Job(DenoiseOptions(str(source), "out.safetensors", model=str(weights), threads=1, device="cpu"))
+    places = _gather(job, [source], np.random.default_rng(0), Progress())
+    start = {name: values.clone() for name, values in job.net.state_dict().items()}
+    assert _keep(job, places, start) == 1
+    confidence = f"partitioner.layers.{len(job.net.config.partitioner) - 1}.bias"
+    assert confidence in start, sorted(start)
+    dim = {**start, confidence: start[confidence].clone()}
+    dim[confidence][-1] += 4  # bright samples count for little
+    job.net.load_state_dict(dim)
+    assert _changed_light(job, places) > LIGHT
+    share = _keep(job, places, dim)
+    assert share in SHARES[1:]
+    assert _changed_light(job, places) <= LIGHT
+    with pytest.raises(InputError, match=r"in\.exr: tuning went astray"):
+        _keep(job, places, {name: values * np.nan for name, values in start.items()})
