@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from deep_io.atomic import Existing
-from deep_io.sequences import has_pattern
-from model.weight_files import SUFFIX
 from pipelines.options import DenoiseOptions
 from pipelines.progress import ProgressKind
+
+if TYPE_CHECKING:
+    from deep_io.atomic import Existing
 
 FIRST_STEPS, STEPS_A_CROP, MOST_STEPS = 24, 8, 96
 """Few crops are soon learned by heart, noise and all; many bear more steps, and gain more by them."""
@@ -35,6 +36,9 @@ class TuneOptions:
     progress: ProgressKind = "auto"
 
     def __post_init__(self) -> None:
+        from deep_io.sequences import has_pattern  # not for `--help`
+        from model.weight_files import SUFFIX
+
         if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps must be at least 1, not {self.steps}")
         if self.most_frames < 1:
