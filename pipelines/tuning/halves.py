@@ -30,7 +30,6 @@ EVEN = 0.16  # mean square distance of times from even ones, in intervals: 1/12 
 FEW = 4  # samples of a pixel, of which fewer do not tell whether they are even
 
 Floats = npt.NDArray[np.float32]
-Index = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -35,12 +35,12 @@ from pipelines.mirrors import ALL_FOUR
 from pipelines.plan import FramePlan
 from pipelines.progress import Progress, make_progress
 from pipelines.signals import raise_if_stopped
+from pipelines.training.recipe import SMALLEST_CROP
 from pipelines.tuning.halves import Crop, cut
 from pipelines.tuning.options import TuneOptions, steps_for
 
 CROP = 128  # pixels along a side, as in training
 CROPS = 4  # a step
-SMALLEST_CROP = 32  # pixels
 MOST_SAMPLES = 1 << 23  # of all crops together; about 0.8 GB
 MOST_OF_A_CROP = 1 << 20  # samples; denoising them, forward and back, takes about 2.5 GB
 RATE, MOMENTUM = 1e-2, 0.9

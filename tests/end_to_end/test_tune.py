@@ -7,9 +7,12 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 
 from deep_io import DeepSamples, Window
+from deep_io.path_samples import SampleReader
+from deep_io.roles import ROLES
 from model import zoo
 from model.metrics import common_scale, relative_squared_error
 from tests.end_to_end.scenes import (
@@ -102,14 +105,29 @@ def test_a_packed_file_is_tuned_to_as_the_samples_it_holds(tmp_path: Path, weigh
         picture = {channel: values.reshape(height, width) for channel, values in samples.channels.items()}
         picture |= {c: (picture[c].astype(np.float32) * rng.lognormal(0, 1, (height, width))).astype(np.float16)
                     for c in "RGB"}
-        import OpenEXR
-
         OpenEXR.File({"type": OpenEXR.scanlineimage}, picture).write(str(tmp_path / f"{name}.exr"))
     packed = in_process("pack", *(tmp_path / f"{name}.exr" for name in names), tmp_path / "deep.exr", "--progress",
                         "none")
     assert packed.code == 0, packed.err
-    run = tuned(tmp_path / "deep.exr", tmp_path / "out.safetensors", weights)
-    assert run.code == 0, run.err
+    with SampleReader(tmp_path / "deep.exr") as reader:
+        held = reader.read()
+    hit = held.coverage > 0
+    channels = {"A": held.coverage}
+    for role, values in held.roles.items():
+        channels |= dict(zip(ROLES[role].channels, values.T.astype(np.float32), strict=True))
+    channels["Z"] = np.where(hit, channels["Z"], np.float32(1e10))
+    plain = DeepSamples(held.counts, {name: np.ascontiguousarray(v) for name, v in channels.items()}, held.window)
+    write_scene(tmp_path / "plain.exr", plain, lbmc__weighting="uniform")
+    states = []
+    for name in ("deep", "plain"):
+        run = tuned(tmp_path / f"{name}.exr", tmp_path / f"{name}.safetensors", weights)
+        assert run.code == 0, run.err
+        states.append(zoo.find(str(tmp_path / f"{name}.safetensors")).load().state_dict())
+    start = zoo.find(str(weights)).load().state_dict()
+    moved = max(float((states[0][name] - start[name]).abs().max()) for name in start)
+    apart = max(float((states[0][name] - states[1][name]).abs().max()) for name in start)
+    assert moved > 0
+    assert apart <= 0.1 * moved
 
 
 def test_weights_tuned_from_mirrored_ones_are_mirrored(tmp_path: Path) -> None:
