@@ -63,6 +63,7 @@ SMALL_FAST = replace(
     guide_gates=1,
     divisor_features=0,
     texture_slope=False,
+    texture_reliability=False,
     filtered_guides=False,
     glare_per_level=0.5,
     glare_in_cells=0.0,

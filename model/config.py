@@ -85,6 +85,7 @@ class Config:
     demodulation: bool = True  # texture, of albedo + specular, is the target's own over what its kernel averaged
     divisor_features: int = 0  # learned features of the kernel that filters the divisor, beside the divisor itself
     texture_slope: bool = False  # how much radiance follows the divisor is also measured behind each kernel
+    texture_reliability: bool = False  # and trusted where divisors are clean, whatever is predicted
     filtered_guides: bool = False  # mix guides with themselves behind the divisor's kernel, as much as is predicted
     glare_per_level: float = 0.5  # what a log unit of glare takes from a source's logit at each coarser level, gated
     glare_in_cells: float = 0.0  # and at all of these levels alike, not gated
@@ -108,6 +109,8 @@ class Config:
             raise ValueError("without demodulation there is no kernel to filter guides by")
         if self.texture_slope and not self.demodulation:
             raise ValueError("without demodulation nothing is measured against a divisor")
+        if self.texture_reliability and not self.texture_slope:
+            raise ValueError("reliability is that of a measured slope, which this network has not")
         if self.kernel == "direct" and len(self.kernel_sizes) > 1:
             if self.variant == "sample_splat":
                 raise ValueError("kernels per sample work at the full resolution only")
@@ -200,6 +203,7 @@ FAST = Config(
     guide_gates=3,
     divisor_features=4,
     texture_slope=True,
+    texture_reliability=True,
     filtered_guides=True,
     glare_per_level=1.0,
     glare_in_cells=0.25,

@@ -27,7 +27,7 @@ from itertools import pairwise
 
 from model.config import DIVISOR_WINDOW, Config, UNetConfig
 from model.features import feature_groups
-from model.guided import GUIDE_SCALES, GUIDED_COLUMNS, generator_sizes
+from model.guided import GUIDE_SCALES, GUIDED_COLUMNS, NOISE_COLUMNS, generator_sizes
 from model.partition import BASIC_COLUMNS
 from model.reducer import context_inputs
 
@@ -155,10 +155,11 @@ def _affinity(config: Config) -> list[Stage]:
     taps = sum(size * size for size in config.kernel_sizes)
     planes = BASIC + 1 + (DIVISOR if config.demodulation else 0) + (SLOPE if config.texture_slope else 0)
     distances = DIVISOR + config.divisor_features
+    noise = NOISE_COLUMNS if config.texture_reliability else 0
     smoothed = len(GUIDE_SCALES) if config.filtered_guides else DIVISOR
     by_divisor = DIVISOR_WINDOW**2 * (distances + smoothed) if config.demodulation else 0
     return [
-        Stage("splat", sample_layer=GUIDED_COLUMNS - 2 + config.embedding + 1),
+        Stage("splat", sample_layer=GUIDED_COLUMNS - 2 + config.embedding + noise + 1),
         Stage("generator", parameters + config.partition_logits * hidden, pixel=pixel, layer=layer),
         Stage("guides", guides, layer=guides),
         Stage("filter", layer=taps * (config.affinity_features + 1 + planes) + by_divisor),

@@ -23,6 +23,7 @@ from model.guided import (
     generator_sizes,
     guide_values,
     initial_guides,
+    noise_values,
     predict,
 )
 from model.networks import Mlp, Products, UNet
@@ -236,7 +237,8 @@ class Denoiser(nn.Module):
             yield part.pixels, self._splat(part, embedding, context[part.pixels], scale, keep)
 
     def _splat(self, part: Chunk, embedding: Tensor, context: Tensor, scale: FrameScale, keep: list[int]) -> Tensor:
-        """(P, L, K) rows: log n, log w, then per unit of occupancy basic values, guides if needed, embedding, extra."""
+        """(P, L, K) rows: log n, log w, then per unit of occupancy basic values, guides if needed, embedding, what
+        noise is measured by if needed, extra."""
         samples = part.samples
         segments = samples.segments
         log_weight = torch.log(samples.weight[:, None])
@@ -247,7 +249,10 @@ class Denoiser(nn.Module):
         values = [basic_values(samples, scale)]
         if self.config.kernel == "affinity":
             values.append(guide_values(samples, scale))
-        values += [embedding.to(values[0].dtype), *extra_values(samples)]
+        values.append(embedding.to(values[0].dtype))
+        if self.config.texture_reliability:
+            values.append(noise_values(samples))
+        values += extra_values(samples)
         result = splat(log_weight, log_partition, columns(values), segments)
         return columns([result.log_n[..., None], result.log_w[..., None], result.values])
 

@@ -15,7 +15,7 @@ from model.affinity import affinity_filter
 from model.config import DIVISOR_WINDOW, Config
 from model.features import FrameScale, divisor, log_depth, log_radiance
 from model.networks import Mlp
-from model.partition import BASIC_COLUMNS, FILTERED, hit_depth, share_of
+from model.partition import BASIC_COLUMNS, FILTERED, hit_depth, share_of, window_sums
 from model.samples import Samples, columns
 
 GUIDE_SCALES = (2.0, 2.0, 2.0, 3.0, 1.5, 1.5, 1.5)  # normal, log depth, divisor: the joint bilateral filter at step 0
@@ -25,12 +25,16 @@ GLARE_SCALE = 2.0  # of glare as a feature
 GLARE_START = 3.0  # log(1 + exposure L): radiance about 20 times the frame's middle
 BLACK = 1e-6  # of the frame's middle
 FLAT = 1e-3  # variance of the divisor, over its square, that says little about the radiance
+NOISE_WINDOW = 3  # pixels; so far around a target the noise of divisors is measured
+KNOWN = 1e-3  # less than this of a window's samples but the first of each pixel: no spread was seen
 DIVISOR_GUIDE_SCALE = 6.0  # the divisor's own, sharper kernel
 
-# Columns of a splat: log n, log w, then per unit of occupancy those of `basic_values`, of `guide_values`, embedding.
+# Columns of a splat: log n, log w, then per unit of occupancy those of `basic_values`, of `guide_values`, embedding,
+# of `noise_values` if the network measures it.
 RADIANCE = slice(2, 5)
 GUIDES = slice(BASIC_COLUMNS, 14)  # normal, log depth, divisor
 GUIDED_COLUMNS = 14
+NOISE_COLUMNS = 2
 
 
 def guide_values(samples: Samples, scale: FrameScale) -> Tensor:
@@ -40,6 +44,15 @@ def guide_values(samples: Samples, scale: FrameScale) -> Tensor:
     if "normal" in samples.roles:
         normal = torch.where(hit, samples.roles["normal"], normal)
     return columns([normal, log_depth(depth, scale.depth), divisor(samples)])
+
+
+def noise_values(samples: Samples) -> Tensor:
+    """(N, NOISE_COLUMNS) what the noise of a pixel's divisor is measured by: its square, mean over the colours, and the
+    sample's weight, or that of each of those it stands for."""
+    weight = samples.weight
+    if samples.squares is not None:
+        weight = samples.squares / torch.where(weight > 0, weight, 1)
+    return columns([divisor(samples).square().mean(1, keepdim=True), weight[:, None]])
 
 
 def glare(radiance: Tensor, exposure: float) -> Tensor:
@@ -91,7 +104,8 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
 
     active : which cells of targets are computed, see `affinity_filter`
 
-    planes (B*L, GUIDED_COLUMNS + E, H, W), of the E extra values the first `lights` are parts of the radiance;
+    planes (B*L, GUIDED_COLUMNS + E, H, W), with `config.texture_reliability` NOISE_COLUMNS more before the E extra
+    values, of which the first `lights` are parts of the radiance;
     predictions (B*L, sum(generator_sizes), H, W) -> (B*L, 6 + E, H, W) per unit of filtered occupancy: radiance,
     coverage, coverage * depth, share, extra values; 0 where no source is in reach.
     """
@@ -117,7 +131,8 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
     if config.demodulation:
         by = planes[:, GUIDES][:, DIVISOR]
         textures = [by, *(_products(planes[:, RADIANCE], by, own) if config.texture_slope else [])]
-    values = torch.cat([planes[:, FILTERED], share, *textures, planes[:, GUIDED_COLUMNS:]], 1)
+    extra = GUIDED_COLUMNS + NOISE_COLUMNS * config.texture_reliability
+    values = torch.cat([planes[:, FILTERED], share, *textures, planes[:, extra:]], 1)
     out = affinity_filter(features, bias, preference, log_n, values, config.kernel_sizes, active)
     if not config.demodulation:
         return out
@@ -126,7 +141,11 @@ def filter_guided(planes: Tensor, predictions: Tensor, guide_matrix: nn.Paramete
         out, [3, 2, 1, 3, 2 * config.texture_slope, lights, rest], 1)
     amount = torch.sigmoid(mix)
     if config.texture_slope:
-        amount = torch.lerp(amount, _slope(color, averaged, products, share, scale.exposure), torch.sigmoid(trust))
+        trusted = torch.sigmoid(trust)
+        if config.texture_reliability:
+            noise = _noise(planes[:, GUIDES][:, DIVISOR] / own, planes[:, GUIDED_COLUMNS:extra] / own, log_w)
+            trusted = torch.lerp(trusted, torch.ones_like(trusted), _reliability(noise, averaged, products, share))
+        amount = torch.lerp(amount, _slope(color, averaged, products, share, scale.exposure), trusted)
     gain = torch.lerp(torch.ones_like(factor), _texture(factor, share, averaged), amount)
     return torch.cat([color * gain, coverage, share, light * gain.repeat(1, lights // 3, 1, 1), data], 1)
 
@@ -143,8 +162,7 @@ def _slope(radiance: Tensor, averaged: Tensor, products: Tensor, share: Tensor, 
     linear regression, as of the guided filter (He et al. 2010), over that of a line through 0. All planes are behind
     the kernel, per unit of occupancy. Over a flat divisor, and where it is black, it is 0.
     """
-    some = share > torch.finfo(share.dtype).tiny ** 0.5
-    per_weight = torch.where(some, 1 / torch.where(some, share, 1), 0)
+    some, per_weight = _per_weight(share)
     light, by = radiance * per_weight, averaged * per_weight
     together, squared = (products * per_weight).split(1, 1)
     covariance = together - _mean_product(light, by)
@@ -154,6 +172,45 @@ def _slope(radiance: Tensor, averaged: Tensor, products: Tensor, share: Tensor, 
     lit = (bright * exposure > BLACK) & some  # the derivative divides by it
     line = bright * (variance.clamp_min(0) + FLAT * squared)
     return torch.where(lit, covariance * _mean_product(by, one) / torch.where(lit, line, 1), 0).clamp(0, 1)
+
+
+def _per_weight(share: Tensor) -> tuple[Tensor, Tensor]:
+    """Where a kernel reached a layer's own weight, and what brings means per unit of occupancy to that of weight."""
+    some = share > torch.finfo(share.dtype).tiny ** 0.5
+    return some, torch.where(some, 1 / torch.where(some, share, 1), 0)
+
+
+@torch.no_grad()
+def _noise(by: Tensor, measured: Tensor, log_w: Tensor) -> Tensor:
+    """(B*L, 1, H, W) variance of the divisor of a pixel's mean, mean over the colours; inf where nothing tells it.
+
+    The variance among a pixel's samples over their number, unbiased, mean over NOISE_WINDOW pixels. Where samples are
+    stratified it is an upper bound. `by` (B*L, 3, H, W) and `measured`, of `noise_values`, per unit of own weight.
+    """
+    squared, weight = measured.split(1, 1)
+    spread = (squared - _mean_product(by, by)).clamp_min(0)
+    there = weight > 0
+    # one over the number of samples: 1 says nothing of the spread
+    lone = torch.where(there, (weight / torch.exp(log_w)[:, None].clamp_min(1e-30)).clamp(0, 1), 1)
+    sums = window_sums(torch.cat([spread * lone, 1 - lone], 1), NOISE_WINDOW)
+    noise, known = sums.split(1, 1)
+    return torch.where(known > KNOWN, noise / known.clamp_min(KNOWN), torch.inf)
+
+
+@torch.no_grad()
+def _reliability(noise: Tensor, averaged: Tensor, products: Tensor, share: Tensor) -> Tensor:
+    """(B*L, 1, H, W) 0..1: how far a slope is to be trusted whatever is predicted; `noise` is that at the target.
+
+    The square of the reliability ratio of a regression on what was measured with errors (Fuller 1987, "Measurement
+    Error Models", section 1.1), which is the part of the divisor's variance among the sources of a kernel that is not
+    noise. It is measured itself, and by its square no scene but one lost more than 1.5 % by it, the ratio's own 2 %.
+    """
+    _, per_weight = _per_weight(share)
+    by, squared = averaged * per_weight, products[:, 1:] * per_weight
+    variance = squared - _mean_product(by, by)
+    varied = variance > 0
+    total = torch.where(varied, variance + FLAT * squared, 1)
+    return torch.where(varied, (variance - noise) / total, 0).clamp(0, 1).square()
 
 
 def _mean_product(first: Tensor, second: Tensor) -> Tensor:

@@ -74,8 +74,8 @@ def test_the_order_of_the_samples_does_not_matter(weights: Path, tmp_path: Path)
 
 
 def test_a_sample_split_into_two_of_half_weight_changes_nothing(tmp_path: Path) -> None:
-    # Without the statistics, which see the effective number of samples: twice as many mean less noise.
-    weights = random_weights(tmp_path / "random.safetensors", statistics=False)
+    # Without what sees the effective number of samples: twice as many mean less noise.
+    weights = random_weights(tmp_path / "random.safetensors", statistics=False, texture_reliability=False)
     samples = noisy_scene(11, SMALL)
     split = DeepSamples(2 * samples.counts, {name: np.repeat(v, 2) for name, v in samples.channels.items()}, SMALL)
     before = denoise(tmp_path, "one", samples, weights)

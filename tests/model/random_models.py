@@ -45,7 +45,8 @@ SMALL: dict[str, Config] = {
     "layer with our encodings": _small("layer", (5,), **_ABLATION),
     "pixel means with affinity": _small("fast", (3, 3), variant="pixel_gather", reducer=(), partition_logits=1,
                                         layers=1, confidence=False, depth_prior=False, demodulation=False,
-                                        divisor_features=0, texture_slope=False, filtered_guides=False),
+                                        divisor_features=0, texture_slope=False, texture_reliability=False,
+                                        filtered_guides=False),
 }
 
 

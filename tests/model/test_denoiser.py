@@ -121,10 +121,12 @@ def test_order_of_samples_is_irrelevant(case: tuple[Denoiser, Samples, int]) -> 
 
 
 def blind_to_count(net: Denoiser) -> Denoiser:
-    """Cuts the one input that may tell a split sample, the effective count: the last channel of the context's input.
+    """Cuts what may tell a split sample: the effective count, the last channel of the context's input, and the noise
+    of divisors, which is measured by it.
 
     The U-Net reads it twice, at its start and through the skip to its last block; convolutions behind it, once more.
     """
+    net.config = dataclasses.replace(net.config, texture_reliability=False)
     if net.config.statistics:
         unet = net.unet
         readers = [unet.encoder[0].convolutions[0], unet.decoder[-1].convolutions[0]]

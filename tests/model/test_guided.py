@@ -9,25 +9,26 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model.config import DIVISOR_WINDOW
+from model.config import DIVISOR_WINDOW, Config
 from model.denoiser import Denoiser
 from model.features import FrameScale
 from model.guided import generator_sizes
 from model.samples import Samples
 from tests.model.random_models import SMALL, random_network, random_samples
 
-CONFIG = replace(SMALL["fast"], confidence=False)  # its weights would favour dark samples
+MEASURED = replace(SMALL["fast"], confidence=False)  # its weights would favour dark samples
+CONFIG = replace(MEASURED, texture_reliability=False)
 HEIGHT, WIDTH = 18, 24
 LIGHT = torch.tensor([0.4, 1.5, 6.0], dtype=torch.float64)
 MIX, TRUST = sum(generator_sizes(CONFIG)[:5]), -1  # rows of what is predicted
 
 
-def _denoised(samples: Samples, mix: float = 0.0, trust: float = -50.0) -> Tensor:
+def _denoised(samples: Samples, mix: float = 0.0, trust: float = -50.0, config: Config = CONFIG) -> Tensor:
     """(3, H, W) in one layer by wide kernels that take no notice of surfaces.
 
     mix : far below 0 the plain path, far above 0 the target's own texture; `trust` far above 0: as measured instead
     """
-    net: Denoiser = random_network(CONFIG, 4)
+    net: Denoiser = random_network(config, 4)
     last = net.generator.layers[-1]
     assert isinstance(last, nn.Linear)
     with torch.no_grad():
@@ -102,3 +103,44 @@ def test_without_samples_near_a_target_the_plain_path_stands() -> None:
     assert bool((closed[:, 9, 11] > 0).all())
     assert torch.equal(open_[:, 9, 11], closed[:, 9, 11])
     assert not torch.allclose(open_[:, 2, 2], closed[:, 2, 2])
+
+
+def _textured(noise: float, count: int) -> Samples:
+    """Pixels of random albedo, lit in proportion to it, `count` samples each, whose albedo is off by `noise`."""
+    draw = torch.Generator().manual_seed(3)
+    samples = random_samples(2, (1, HEIGHT, WIDTH), count)
+    rows = HEIGHT * WIDTH, count, 3
+    clean = 0.3 + 0.4 * torch.rand(rows[0], 1, 3, generator=draw, dtype=torch.float64) * (noise == 0)
+    albedo = (clean + noise * (torch.rand(rows, generator=draw, dtype=torch.float64) - 0.5)).reshape(-1, 3)
+    weight = torch.full_like(samples.weight, 1 / count)
+    samples = replace(samples, coverage=torch.ones_like(samples.coverage), weight=weight)
+    roles = {"depth": torch.full_like(samples.roles["depth"], 2.0), "albedo": albedo,
+             "specular": torch.zeros_like(albedo), "radiance": LIGHT * albedo}
+    return replace(samples, roles=samples.roles | roles)
+
+
+def test_a_slope_over_clean_divisors_is_trusted_whatever_is_predicted() -> None:
+    samples = _textured(0.0, 4)
+    measured, predicted = (_denoised(samples, -50.0, trust) for trust in (50.0, -50.0))
+    apart = (measured - predicted).abs().mean()
+    assert apart > 0.03 * predicted.mean()
+    assert (_denoised(samples, -50.0, config=MEASURED) - measured).abs().mean() < 0.1 * apart
+
+
+def test_a_slope_over_noise_is_trusted_as_far_as_is_predicted() -> None:
+    """All that the divisors differ by is their samples' noise."""
+    samples = _textured(0.4, 8)
+    measured, predicted = (_denoised(samples, -50.0, trust) for trust in (50.0, -50.0))
+    apart = (measured - predicted).abs().mean()
+    assert apart > 0.02 * predicted.mean()
+    assert (_denoised(samples, -50.0, config=MEASURED) - predicted).abs().mean() < 0.25 * apart
+
+
+def test_of_one_sample_a_pixel_nothing_tells_the_noise() -> None:
+    samples = _textured(0.0, 1)
+    assert torch.equal(_denoised(samples, -50.0, config=MEASURED), _denoised(samples, -50.0))
+
+
+def test_reliability_without_a_slope_is_refused() -> None:
+    with pytest.raises(ValueError, match="slope"):
+        replace(SMALL["fast"], texture_slope=False)
