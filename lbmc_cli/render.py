@@ -25,8 +25,8 @@ from lbmc_cli.report import end_job
     metavar="FILE.xml",
     help="Views of this Mitsuba scene, with random cameras, lenses and motion, in place of random scenes.",
 )
-@option("--layout", metavar="NAME", help="Only interior, outdoor, tabletop, floating or abstract scenes.  [default: a "
-        "mix of all but abstract]")
+@option("--layout", metavar="NAME", help="Only interior, outdoor, tabletop, floating, abstract or bright scenes.  "
+        "[default: a mix of the first four]")
 @option("--defocus/--no-defocus", default=None, help="Defocus in every scene, or in none.  [default: in half]")
 @option("--motion/--no-motion", default=None, help="Motion in every scene, or in none.  [default: in half]")
 @option("--workers", type=THREAD_COUNT, default=1, show_default=True, help="Processes that render side by side.")

@@ -9,14 +9,17 @@ where the mean is over the pixels of the cell, so that a cell that straddles an 
 quadratic B-spline over three cells (nothing for level 0), so that no cell boundary shows, and n_s the occupancy. One
 normalisation per target over all taps of all levels: out_t = sum_s softmax(logit)_s value_s. Targets keep their full
 resolution at every level, so coarse levels respect edges too.
+
+It is computed as attention: a block of targets shares the union of their windows, so that logits and means are products
+of small matrices, and what lies outside a target's own window has a logit of -inf. On a CPU that is four to five times
+as fast as one tap after the other, though only two thirds of the products count.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from copy import copy
-from itertools import groupby
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -24,6 +27,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 ACTIVE_CELL = 64  # pixels; targets are filtered, or left out, in cells of this size at inference
+BLOCK = 4  # pixels; targets of a square of this side share their sources
+CHUNK = {"cpu": 32, "cuda": 4096}  # blocks filtered at once: what fits the caches, or fills a GPU
+BACKWARD_CHUNK = 256  # blocks whose gradients are added up at once
 
 
 def pool_cells(log_n: Tensor, planes: Tensor, size: int) -> tuple[Tensor, Tensor]:
@@ -61,136 +67,133 @@ def spline_logs(size: int, window: int, like: Tensor) -> Tensor:
     return torch.log(torch.where(distance <= 0.5, inner, outer))
 
 
-class _Level:
-    """One level's cells, padded by the window's radius and repeated along x to the picture's width."""
+@dataclass(frozen=True)
+class _Windows:
+    """Which rows of the table of all levels' cells the blocks of a picture see, and their windows' fixed logits.
 
-    def __init__(self, size: int, window: int, bias: Tensor, features: Tensor, values: Tensor) -> None:
-        self.size, self.window, radius = size, window, window // 2
-        self.rows, self.cols = bias.shape[-2], bias.shape[-1]
-        self.bias = F.pad(bias, (radius, radius, radius, radius), value=-torch.inf)
-        self.features = F.pad(features, (radius, radius, radius, radius))
-        self.values = F.pad(values, (radius, radius, radius, radius))
-        self.log_spline = spline_logs(size, window, bias)
-        self.wide = [self._widen(plane) for plane in (self.bias, self.features, self.values)]
+    The table holds the cells of the finest level, row by row, then those of the next; each level with a border of its
+    windows' radius. A block sees S of them, the union of its targets' windows, at the same offsets from where it starts
+    in each level.
 
-    def tile(self, image: int, rows: slice, cols: slice) -> _Level:
-        """The same level with only these targets of one image; rows and columns are multiples of the level's size."""
-        part = copy(self)
-        top, left = rows.start // self.size, cols.start // self.size * self.size
-        part.rows, part.cols = (rows.stop - rows.start) // self.size, (cols.stop - cols.start) // self.size
-        down = slice(top, top + part.rows + self.window - 1)
-        along = slice(left, left + (part.cols + self.window - 1) * self.size)
-        part.wide = [plane[image : image + 1, ..., down, along] for plane in self.wide]
-        return part
+    sizes, pitches, firsts : (levels,) pixels along a cell, cells along a row of the table, the table's first cell
+    level, offset : (S,) each source's level, and its offset from the block's start there
+    splines : (phases^2, BLOCK^2, S) log of each source's B-spline weight for each target, -inf outside its window; a
+        block's phase along an axis is where it lies in a cell of the coarsest level
+    rows : of the table
+    """
 
-    def _widen(self, plane: Tensor) -> Tensor:
-        return plane if self.size == 1 else plane.repeat_interleave(self.size, -1)
-
-    def narrow(self, wide: Tensor) -> Tensor:
-        """The adjoint of padding and widening: (B, C, rows + 2r, (cols + 2r) * size) -> (B, C, rows, cols)."""
-        radius = self.window // 2
-        if self.size > 1:
-            wide = torch.unflatten(wide, -1, (-1, self.size)).sum(-1)
-        return wide[..., radius : radius + self.rows, radius : radius + self.cols]
-
-    def taps(self) -> Iterator[tuple[int, int, slice, slice]]:
-        """Every tap (dy, dx) of the window with the rows and columns of the padded, widened cells that it reads."""
-        for dy in range(self.window):
-            for dx in range(self.window):
-                start = dx * self.size
-                yield dy, dx, slice(dy, dy + self.rows), slice(start, start + self.cols * self.size)
-
-    def spline(self, dy: int, dx: int) -> Tensor:
-        """(1, size, W): log B-spline weights of this tap over the pixels of a row of cells."""
-        along_x = self.log_spline[dx].repeat(self.cols)
-        return self.log_spline[dy][:, None] + along_x[None, :]
-
-
-def _filter(levels: Sequence[_Level], target: Tensor, preference: Tensor) -> tuple[Tensor, Tensor]:
-    """Means (B, C, H, W) over all taps of all levels, and the taps' weights (taps, B, H, W), which sum to 1."""
-    batch, _, height, width = target.shape
-    logits = target.new_empty(sum(level.window**2 for level in levels), batch, height, width)
-    tap = 0
-    for number, level in enumerate(levels):
-        aim = torch.unflatten(target, 2, (level.rows, level.size))
-        wish = torch.unflatten(preference[:, number], 1, (level.rows, level.size))
-        bias, features, _ = level.wide
-        for dy, dx, rows, cols in level.taps():
-            logit = logits[tap].view(batch, level.rows, level.size, width)
-            torch.add(wish, level.spline(dy, dx), out=logit)
-            logit += bias[:, rows, None, cols]
-            source = features[:, :, rows, None, cols]
-            for k in range(source.shape[1]):
-                logit.addcmul_(aim[:, k], source[:, k], value=2.0)
-            tap += 1
-    peak = logits.amax(0)
-    peak = torch.where(peak == -torch.inf, 0, peak)
-    logits.sub_(peak).exp_()
-    total = logits.sum(0)
-    logits.div_(torch.where(total > 0, total, 1))
-    out = target.new_zeros(batch, levels[0].values.shape[1], height, width)
-    tap = 0
-    for level in levels:
-        result = out.view(batch, -1, level.rows, level.size, width)
-        values = level.wide[2]
-        for _, _, rows, cols in level.taps():
-            weight = logits[tap].view(batch, level.rows, level.size, width)
-            for k in range(result.shape[1]):
-                result[:, k].addcmul_(weight, values[:, k, rows, None, cols])
-            tap += 1
-    return out, logits
-
-
-class _AffinityFilter(torch.autograd.Function):
-    """The tap loop with a hand-written derivative: intermediate products of 50 taps would not fit the caches."""
+    sizes: Tensor
+    pitches: Tensor
+    firsts: Tensor
+    level: Tensor
+    offset: Tensor
+    splines: Tensor
+    phases: int
+    rows: int
 
     @staticmethod
-    def forward(ctx: Any, target: Tensor, preference: Tensor, sizes: Sequence[int], windows: Sequence[int],
-                *cells: Tensor) -> Tensor:
-        levels = _levels(sizes, windows, cells)
-        out, logits = _filter(levels, target, preference)
-        ctx.save_for_backward(target, logits, out, *cells)
-        ctx.sizes, ctx.windows = sizes, windows
+    def of(windows: Sequence[int], height: int, width: int, like: Tensor) -> _Windows:
+        """Of pictures of height x width pixels, multiples of BLOCK and of the coarsest cells; in the type of `like`."""
+        device = like.device
+        phases = max(1, 2 ** (len(windows) - 1) // BLOCK)
+        sizes = [2**number for number in range(len(windows))]
+        pitches, firsts, level, offset, splines, rows = [], [], [], [], [], 0
+        for number, (size, window) in enumerate(zip(sizes, windows, strict=True)):
+            pitch = width // size + window - 1
+            span = torch.arange(max(1, BLOCK // size) + window - 1, device=device)
+            along = _axis_logs(size, window, phases, span, like)
+            both = along[:, None, :, None, :, None] + along[None, :, None, :, None, :]
+            pitches.append(pitch)
+            firsts.append(rows)
+            offset.append((span[:, None] * pitch + span).flatten())
+            level.append(torch.full_like(offset[-1], number))
+            splines.append(both.reshape(phases**2, BLOCK**2, -1))
+            rows += (height // size + window - 1) * pitch
+        return _Windows(torch.tensor(sizes, device=device), torch.tensor(pitches, device=device),
+                        torch.tensor(firsts, device=device), torch.cat(level), torch.cat(offset),
+                        torch.cat(splines, -1), phases, rows)
+
+    def sources(self, image: Tensor, y: Tensor, x: Tensor) -> Tensor:
+        """(N, S) rows of the table, each image's behind the other's, that blocks number y, x see."""
+        down, right = (torch.div(number[:, None] * BLOCK, self.sizes, rounding_mode="floor") for number in (y, x))
+        start = self.firsts + down * self.pitches + right + (image * self.rows)[:, None]
+        return start[:, self.level] + self.offset
+
+    def phase(self, y: Tensor, x: Tensor) -> Tensor:
+        """(N,) which of `splines` holds for blocks number y, x."""
+        return y % self.phases * self.phases + x % self.phases
+
+
+def _axis_logs(size: int, window: int, phases: int, span: Tensor, like: Tensor) -> Tensor:
+    """(phases, BLOCK, sources) along one axis: log B-spline weights of the cells a block sees, `span` from its start,
+    for each of its targets; -inf where a cell is outside a target's window."""
+    pixel = (torch.arange(phases, device=like.device) * BLOCK)[:, None] + torch.arange(BLOCK, device=like.device)
+    start = torch.div(pixel[:, :1], size, rounding_mode="floor")
+    tap = start[..., None] + span - torch.div(pixel, size, rounding_mode="floor")[..., None]
+    logs = spline_logs(size, window, like)[tap.clamp(0, window - 1), (pixel % size)[..., None].expand_as(tap)]
+    return torch.where((tap >= 0) & (tap < window), logs, -torch.inf)
+
+
+class _BlockFilter(torch.autograd.Function):
+    """Attention of blocks of targets, with a derivative that computes its weights anew: all of them would fill memory.
+
+    queries (N, BLOCK^2, K), table (rows, K + C): a logit is a query times the first K columns plus `splines`, a value
+    the other C. Blocks are numbered y, x in their image, all (N,). -> (N, BLOCK^2, C)
+    """
+
+    @staticmethod
+    def forward(ctx: Any, queries: Tensor, table: Tensor, blocks: Sequence[Tensor], windows: _Windows) -> Tensor:
+        keys = queries.shape[2]
+        out = queries.new_empty(*queries.shape[:2], table.shape[1] - keys)
+        for part in _chunks(len(queries), CHUNK.get(queries.device.type, CHUNK["cuda"])):
+            sources = _sources(table, blocks, windows, part)
+            torch.bmm(_weights(queries[part], sources, blocks, windows, part), sources[..., keys:], out=out[part])
+        ctx.save_for_backward(queries, table, out, *blocks)
+        ctx.windows = windows
         return out
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Any:
-        target, weights, out, *cells = ctx.saved_tensors
-        levels = _levels(ctx.sizes, ctx.windows, cells)
-        batch, _, height, width = target.shape
-        grad = grad.contiguous()
-        common = (grad * out).sum(1)  # (B, H, W): subtracted by the softmax's derivative
-        grad_target = torch.zeros_like(target)
-        grad_preference = target.new_zeros(batch, len(levels), height, width)
-        grad_cells: list[Tensor] = []
-        tap = 0
-        for number, level in enumerate(levels):
-            shape = (batch, -1, level.rows, level.size, width)
-            aim, pull, back = target.view(shape), grad.view(shape), grad_target.view(shape)
-            base = common.view(batch, level.rows, level.size, width)
-            wish = grad_preference[:, number].view(batch, level.rows, level.size, width)
-            features, values = level.wide[1:]
-            to_bias, to_features, to_values = (torch.zeros_like(plane) for plane in level.wide)
-            for _, _, rows, cols in level.taps():
-                weight = weights[tap].view(batch, level.rows, level.size, width)
-                inner = -base
-                for k in range(values.shape[1]):
-                    inner.addcmul_(pull[:, k], values[:, k, rows, None, cols])
-                    to_values[:, k, rows, cols] += (weight * pull[:, k]).sum(2)
-                inner *= weight  # d loss / d logit
-                wish += inner
-                to_bias[:, rows, cols] += inner.sum(2)
-                for k in range(features.shape[1]):
-                    back[:, k].addcmul_(inner, features[:, k, rows, None, cols], value=2.0)
-                    to_features[:, k, rows, cols] += (inner * aim[:, k]).sum(2).mul_(2.0)
-                tap += 1
-            grad_cells += [level.narrow(to_bias), level.narrow(to_features), level.narrow(to_values)]
-        return grad_target, grad_preference, None, None, *grad_cells
+        queries, table, out, *blocks = ctx.saved_tensors
+        windows, keys = ctx.windows, queries.shape[2]
+        common = (grad * out).sum(2, keepdim=True)  # subtracted by the softmax's derivative
+        to_queries, to_table = torch.empty_like(queries), torch.zeros_like(table)
+        for large in _chunks(len(queries), BACKWARD_CHUNK):
+            rows = windows.sources(*(number[large] for number in blocks))
+            to_sources = table.new_empty(*rows.shape, table.shape[1])
+            for small in _chunks(len(rows), CHUNK.get(queries.device.type, CHUNK["cuda"])):
+                part = slice(large.start + small.start, large.start + small.stop)
+                sources = _sources(table, blocks, windows, part)
+                weights = _weights(queries[part], sources, blocks, windows, part)
+                torch.bmm(weights.transpose(1, 2), grad[part], out=to_sources[small, :, keys:])
+                inner = torch.baddbmm(-common[part].expand_as(weights), grad[part],
+                                      sources[..., keys:].transpose(1, 2)).mul_(weights)  # d loss / d logit
+                # keys of empty cells are -inf; no weight, no derivative
+                torch.bmm(inner, sources[..., :keys].nan_to_num_(neginf=0.0), out=to_queries[part])
+                torch.bmm(inner.transpose(1, 2), queries[part], out=to_sources[small, :, :keys])
+            first, last = int(rows.min()), int(rows.max()) + 1
+            summed = torch.ops.aten.embedding_dense_backward(to_sources, rows - first, last - first, -1, False)
+            to_table[first:last] += summed
+        return to_queries, to_table, None, None
 
 
-def _levels(sizes: Sequence[int], windows: Sequence[int], cells: Sequence[Tensor]) -> list[_Level]:
-    triples = zip(cells[0::3], cells[1::3], cells[2::3], strict=True)
-    return [_Level(s, w, *planes) for s, w, planes in zip(sizes, windows, triples, strict=True)]
+def _chunks(count: int, size: int) -> Iterator[slice]:
+    return (slice(start, min(start + size, count)) for start in range(0, count, size))
+
+
+def _sources(table: Tensor, blocks: Sequence[Tensor], windows: _Windows, part: slice) -> Tensor:
+    """(N, S, K + C): what some of the blocks see."""
+    rows = windows.sources(*(number[part] for number in blocks))
+    return table.index_select(0, rows.flatten()).view(*rows.shape, -1)
+
+
+def _weights(queries: Tensor, sources: Tensor, blocks: Sequence[Tensor], windows: _Windows, part: slice) -> Tensor:
+    """(N, BLOCK^2, S): weights that sum to 1, all 0 where no source is in reach."""
+    _, y, x = (number[part] for number in blocks)
+    logits = windows.splines.index_select(0, windows.phase(y, x))
+    logits.baddbmm_(queries, sources[..., : queries.shape[2]].transpose(1, 2))
+    weights = torch.softmax(logits, 2)
+    return weights.nan_to_num_(0.0) if bool(weights[..., 0].isnan().any()) else weights
 
 
 def affinity_filter(
@@ -211,57 +214,68 @@ def affinity_filter(
     values : (B, C, H, W) per unit of occupancy
     windows : odd window size of each level, in cells of 2**level pixels
     active : (B, ceil(H / 64), ceil(W / 64)) bool, which cells of ACTIVE_CELL pixels are wanted; default all. The
-        targets of others are left out and 0, their sources count. Not with a gradient, nor above 7 levels.
+        targets of others are left out and 0, their sources count. Not with a gradient.
 
     Returns
     -------
     (B, C, H, W) means over the reached sources; 0 where no source is in reach.
     """
+    batch, height, width = log_n.shape
     if active is not None:
-        shape = (len(log_n), *(math.ceil(side / ACTIVE_CELL) for side in log_n.shape[-2:]))
-        if torch.is_grad_enabled() or len(windows) > 7 or active.shape != shape:
-            raise ValueError(f"active cells {tuple(active.shape)}, expected {shape}, at most 7 levels, no gradient")
+        shape = (batch, *(math.ceil(side / ACTIVE_CELL) for side in (height, width)))
+        if torch.is_grad_enabled() or active.shape != shape:
+            raise ValueError(f"active cells {tuple(active.shape)}, expected {shape}, no gradient")
     # Only differences of features count, and |f_t - f_s|^2 is computed as |f_t|^2 - 2 f_t f_s + |f_s|^2: what all
     # features have in common would only cost digits.
     features = features - features.detach().mean((2, 3), keepdim=True)
-    height, width = log_n.shape[-2:]
-    size = 2 ** (len(windows) - 1)
-    pad = (0, math.ceil(width / size) * size - width, 0, math.ceil(height / size) * size - height)
+    size = max(BLOCK, 2 ** (len(windows) - 1))
+    pad = (0, -width % size, 0, -height % size)
     if any(pad):
         features, values = F.pad(features, pad), F.pad(values, pad)
         source_bias, target_preference = F.pad(source_bias, pad), F.pad(target_preference, pad)
         log_n = F.pad(log_n, pad, value=-torch.inf)
-    cells: list[Tensor] = []
-    sizes = [2**number for number in range(len(windows))]
+    layout = _Windows.of(windows, log_n.shape[1], log_n.shape[2], features)
+    table = _table(features, source_bias, log_n, values, windows)
+    # a query is 2 f_t, 1 and v_t; a key f_s, the source's own logit and 1 at its level
+    queries = _blocks(torch.cat([2 * features, torch.ones_like(features[:, :1]), target_preference], 1))
+    there = torch.ones(queries.shape[:3], dtype=torch.bool, device=queries.device)
+    if active is not None:
+        cell = ACTIVE_CELL // BLOCK
+        there = active.repeat_interleave(cell, 1).repeat_interleave(cell, 2)[:, : there.shape[1], : there.shape[2]]
+        there = F.pad(there, (0, queries.shape[2] - there.shape[2], 0, queries.shape[1] - there.shape[1]))
+    blocks = there.nonzero(as_tuple=True)
+    apply: Callable[..., Tensor] = _BlockFilter.apply
+    found = apply(queries[there], table, blocks, layout)
+    out = found.new_zeros(*there.shape, *found.shape[1:])
+    out[there] = found
+    return _picture(out)[..., :height, :width]
+
+
+def _table(features: Tensor, source_bias: Tensor, log_n: Tensor, values: Tensor, windows: Sequence[int]) -> Tensor:
+    """(B * rows, K + C): what `_Windows` numbers the rows of. Keys: features, the source's own logit, its level."""
     planes = torch.cat([features, values, features.square().sum(1, keepdim=True)], 1)
-    for number, cell in enumerate(sizes):
-        biased = log_n + source_bias[:, number]
-        bias, means = pool_cells(biased, planes, cell)
+    tables = []
+    for number, window in enumerate(windows):
+        bias, means = pool_cells(log_n + source_bias[:, number], planes, 2**number)
         feature, value, norm = torch.split(means, [features.shape[1], values.shape[1], 1], 1)
-        cells += [bias - norm[:, 0], feature, value]
-    if torch.is_grad_enabled():
-        apply: Callable[..., Tensor] = _AffinityFilter.apply
-        return apply(features, target_preference, sizes, tuple(windows), *cells)[..., :height, :width]
-    levels = _levels(sizes, windows, cells)
-    out = torch.zeros_like(values)
-    for image, rows, cols in _tiles(out, active, size):
-        tile = [level.tile(image, rows, cols) for level in levels]
-        here = (slice(image, image + 1), slice(None), rows, cols)
-        out[here] = _filter(tile, features[here], target_preference[here])[0]
-    return out[..., :height, :width]
+        level = torch.zeros_like(source_bias[..., : bias.shape[1], : bias.shape[2]])
+        level[:, number] = 1
+        border = [window // 2] * 4
+        own = F.pad(bias[:, None] - norm, border, value=-torch.inf)
+        first, *rest = (F.pad(plane, border) for plane in (feature, level, value))
+        tables.append(torch.cat([first, own, *rest], 1).flatten(2))
+    return torch.cat(tables, 2).transpose(1, 2).reshape(-1, features.shape[1] + 1 + len(windows) + values.shape[1])
 
 
-def _tiles(picture: Tensor, active: Tensor | None, size: int) -> Iterator[tuple[int, slice, slice]]:
-    """Images, rows and columns that cover the active cells of a picture (B, C, H, W): runs of cells along a row."""
-    batch, _, height, width = picture.shape
-    step = max(ACTIVE_CELL, size)
-    for image in range(batch):
-        for row in range(math.ceil(height / step)):
-            rows = slice(row * step, min((row + 1) * step, height))
-            wanted = [True] * math.ceil(width / step) if active is None else active[image, row].tolist()
-            start = 0
-            for on, run in groupby(wanted):
-                stop = start + len(list(run))
-                if on:
-                    yield image, rows, slice(start * step, min(stop * step, width))
-                start = stop
+def _blocks(picture: Tensor) -> Tensor:
+    """(B, C, H, W) -> (B, H / BLOCK, W / BLOCK, BLOCK^2, C)."""
+    batch, channels, height, width = picture.shape
+    split = picture.view(batch, channels, height // BLOCK, BLOCK, width // BLOCK, BLOCK)
+    return split.permute(0, 2, 4, 3, 5, 1).reshape(batch, height // BLOCK, width // BLOCK, BLOCK**2, channels)
+
+
+def _picture(blocks: Tensor) -> Tensor:
+    """The inverse of `_blocks`."""
+    batch, down, right, _, channels = blocks.shape
+    split = blocks.view(batch, down, right, BLOCK, BLOCK, channels)
+    return split.permute(0, 5, 1, 3, 2, 4).reshape(batch, channels, down * BLOCK, right * BLOCK)

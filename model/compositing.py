@@ -124,15 +124,19 @@ def fill_holes(layers: Layers) -> Layers:
     depth = torch.where(layers.depth.isfinite(), layers.depth, 0) * layers.coverage
     stack = torch.cat([layers.color.flatten(1, 2), layers.weight, layers.coverage, depth, layers.extra.flatten(1, 2),
                        reached.to(depth.dtype)], 1)
-    filled, known, size = stack, reached, 1
-    while not bool(known.all()) and size < max(height, width):
+    holes = torch.stack((~reached[:, 0]).nonzero(as_tuple=True))  # image, row, column
+    sums, size, places, values = stack, 1, [], []
+    while holes.shape[1] and size < max(height, width):
         size *= 2
-        pad = (0, -width % size, 0, -height % size)
-        sums = F.avg_pool2d(F.pad(stack, pad), size)
-        up = sums.repeat_interleave(size, 2).repeat_interleave(size, 3)[..., :height, :width]
-        found = ~known & (up[:, -1:] > 0)
-        filled = torch.where(found, up / torch.where(up[:, -1:] > 0, up[:, -1:], 1), filled)
-        known = known | found
+        sums = F.avg_pool2d(F.pad(sums, (0, sums.shape[-1] % 2, 0, sums.shape[-2] % 2)), 2)
+        cell = sums[holes[0], :, holes[1] // size, holes[2] // size]
+        found = cell[:, -1] > 0
+        places.append(holes[:, found])
+        values.append(cell[found] / cell[found, -1:])
+        holes = holes[:, ~found]
+    image, row, column = torch.cat(places, 1)
+    filled = stack.clone()
+    filled[image, :, row, column] = torch.cat(values)
     sizes = [3 * count, count, count, count, count * layers.extra.shape[2], 1]
     color, weight, coverage, depth, extra, _ = torch.split(filled, sizes, 1)
     basic = [plane[:, :, None] for plane in (coverage, depth, weight)]

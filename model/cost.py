@@ -2,7 +2,8 @@
 
 A stage has work per sample, per pixel, per layer (and pixel), and per sample and layer. At s samples per pixel and L
 layers a pixel takes    pixel + s * sample + L * layer + s * L * sample_layer    multiply-adds.
-Counted are matrix products, convolutions and filter taps; activations, exponentials and encodings are not.
+Counted are matrix products, convolutions and filter taps; activations, exponentials and encodings are not. Affinity
+kernels are computed in blocks, which takes half as many again (`model/affinity.py`).
 
 By hand, for LAYER (20 features, embedding 32, context 128, 17 x 17 taps):
     reducer      20*32 + 32*32 + 32*32 = 2688 per sample; with 3*32 biases 2784 parameters

@@ -1,4 +1,4 @@
-"""Whole scenes, each a function that fills a Stage: outdoors, tabletops, floating clutter, abstract bodies.
+"""Whole scenes, each a function that fills a Stage: outdoors, tabletops, clutter in the air, abstract and bright ones.
 
 Interiors are in interiors.py; LAYOUTS lists them all with their shares.
 """
@@ -214,11 +214,87 @@ def _lights_of_every_size(stage: Stage, w: float, d: float, h: float) -> None:
             stage.add(g.superellipsoid([size / 2] * 3, 1.0, 16), light, at - UP * size / 4)
 
 
+def bright(stage: Stage) -> None:
+    """A few bodies on a wide floor in even, soft light: smooth shading, strong colours and coarse textures.
+
+    Little noise, where every blotch, lost edge or smeared gradient shows.
+    """
+    rng = stage.rng
+    stage.kind = "bright"
+    closed = rng.random() < 0.4
+    stage.tags.append("closed" if closed else "open")
+    extent = rng.uniform(3, 7) if closed else float(np.exp(rng.uniform(np.log(4), np.log(40))))
+    h = rng.uniform(2.5, 5)
+    floor = g.quad([-extent, 0, -extent], [0, 0, 2 * extent], [2 * extent, 0, 0], _coarse(rng))
+    stage.add(floor, _vivid(stage, 0.3))
+    walls = [([-extent, 0, -extent], [2 * extent, 0, 0]), ([-extent, 0, extent], [0, 0, -2 * extent]),
+             ([extent, 0, -extent], [0, 0, 2 * extent]), ([extent, 0, extent], [-2 * extent, 0, 0])]
+    for corner, along in walls[:4 if closed else int(rng.integers(0, 3))]:
+        stage.add(g.quad(corner, along, [0, h, 0], _coarse(rng)), _vivid(stage, 0.15))
+    if closed:
+        stage.environment = environment.uniform(rng, 0.0)
+        stage.add(g.quad([-extent, h, -extent], [2 * extent, 0, 0], [0, 0, 2 * extent]), stage.material(
+            "matte", texture=stage.textured("plain")))
+        for _ in range(int(rng.integers(1, 4))):
+            size = extent * rng.uniform(0.3, 1.0)
+            at = np.array([rng.uniform(-0.5, 0.5) * extent, h * 0.97, rng.uniform(-0.5, 0.5) * extent])
+            stage.add(g.quad(at - np.array([size / 2, 0, size / 2]), [size, 0, 0], [0, 0, size]),
+                      stage.light(stage.warm_or_cool(rng.uniform(2, 10) / size)))
+    else:
+        maps = (environment.sky, environment.sky, environment.uniform, environment.studio)
+        stage.environment = maps[int(rng.integers(4))](rng)
+    for _ in range(int(rng.integers(2, 12))):
+        at = np.array([rng.uniform(-2.5, 2.5), rng.uniform(0, 0.4) * (rng.random() < 0.2), rng.uniform(-2.5, 2.5)])
+        size = float(np.exp(rng.uniform(np.log(0.3), np.log(2.2))))
+        if rng.random() < 0.12:
+            props.vessel(stage, at, size)
+        else:
+            props.solid(stage, at, size, stage.any_material() if rng.random() < 0.25 else _vivid(stage, 0.5))
+    if rng.random() < 0.15:
+        _rods(stage, int(rng.integers(10, 60)))
+
+    def camera(draw: np.random.Generator) -> Camera:
+        angle, radius = draw.uniform(0, 6.28), draw.uniform(1.5, 0.9 * min(extent, 5))
+        origin = np.array([radius * np.cos(angle), draw.uniform(0.3, 0.8 * h), radius * np.sin(angle)])
+        target = np.array([draw.normal() * 0.8, draw.uniform(0, 0.9), draw.normal() * 0.8])
+        return Camera.look_at(origin, target, draw.uniform(30, 65), draw.normal() * ROLL)
+
+    stage.camera = camera
+
+
+def _coarse(rng: np.random.Generator) -> float:
+    """Repeats of a texture per metre: patterns of 0.1 m to several metres."""
+    return float(np.exp(rng.uniform(np.log(0.08), np.log(0.8))))
+
+
+def _vivid(stage: Stage, shiny: float) -> int:
+    """Matte, or with probability `shiny` any opaque material, in a tint that is saturated more often than not."""
+    rng = stage.rng
+    if rng.random() < shiny:
+        return stage.bold_material()
+    hue = rng.uniform(0.05, 1, 3)
+    tint = 1 + (hue / hue.max() - 1) * rng.uniform() ** 0.5
+    texture = stage.textured(str(rng.choice(["plain", "plain", "checker", "brick", "marble", "stripes", "dots",
+                                             "terrazzo", "poster", "gradient", "wood"])))
+    return stage.material("matte", texture=np.clip(texture * tint, 0.02, 0.95).astype(np.float32))
+
+
+def _rods(stage: Stage, count: int) -> None:
+    """Thin rods that stand and lean, all of one material."""
+    rng = stage.rng
+    slot = _vivid(stage, 0.3)
+    for _ in range(count):
+        foot = np.array([rng.uniform(-3, 3), 0, rng.uniform(-3, 3)])
+        top = foot + UP * rng.uniform(1, 4) + rng.normal(size=3) * 0.5
+        stage.add(g.tube(np.linspace(foot, top, 2), rng.uniform(0.01, 0.08), 8), slot, movable=True)
+
+
 LAYOUTS: dict[str, tuple[float, Callable[[Stage], None]]] = {
     "interior": (0.52, interior),
     "outdoor": (0.22, outdoor),
     "tabletop": (0.17, tabletop),
     "floating": (0.09, floating),
     "abstract": (0.0, abstract),
+    "bright": (0.0, bright),
 }
 """Name -> share of the scenes, function. What came later has none, so that every seed keeps its scene."""

@@ -50,5 +50,9 @@ def test_products_are_those_that_run(name: str, layers: int) -> None:
     counted = count(config).multiply_adds(3, layers)
     # What the counter does not see: taps, and weighted sums over samples, matrix products in one variant only.
     unseen = ("filter",) if config.variant == "sample_splat" else ("filter", "splat", "statistics")
+    seen = dict(counter.get_flop_counts()["Global"])
+    if config.kernel == "affinity":  # batched products are its blocks', which are more than its taps, and its guides'
+        unseen += ("guides",)
+        del seen[torch.ops.aten.bmm]
     products = sum(value for stage, value in counted.items() if not stage.startswith(unseen))
-    assert counter.get_total_flops() == 2 * products * 16 * 24
+    assert sum(seen.values()) == 2 * products * 16 * 24
