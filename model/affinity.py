@@ -238,17 +238,20 @@ def affinity_filter(
     table = _table(features, source_bias, log_n, values, windows)
     # a query is 2 f_t, 1 and v_t; a key f_s, the source's own logit and 1 at its level
     queries = _blocks(torch.cat([2 * features, torch.ones_like(features[:, :1]), target_preference], 1))
-    there = torch.ones(queries.shape[:3], dtype=torch.bool, device=queries.device)
+    down, right = (side // BLOCK for side in log_n.shape[1:])
+    wanted = torch.ones(batch, down, right, dtype=torch.bool, device=log_n.device)
     if active is not None:
         cell = ACTIVE_CELL // BLOCK
-        there = active.repeat_interleave(cell, 1).repeat_interleave(cell, 2)[:, : there.shape[1], : there.shape[2]]
-        there = F.pad(there, (0, queries.shape[2] - there.shape[2], 0, queries.shape[1] - there.shape[1]))
-    blocks = there.nonzero(as_tuple=True)
+        shown = active.repeat_interleave(cell, 1).repeat_interleave(cell, 2)[:, :down, :right]
+        wanted = F.pad(shown, (0, right - shown.shape[2], 0, down - shown.shape[1]))
+    all_of_them = bool(wanted.all())
     apply: Callable[..., Tensor] = _BlockFilter.apply
-    found = apply(queries[there], table, blocks, layout)
-    out = found.new_zeros(*there.shape, *found.shape[1:])
-    out[there] = found
-    return _picture(out)[..., :height, :width]
+    chosen = queries if all_of_them else queries[wanted.flatten()]
+    means = apply(chosen, table, wanted.nonzero(as_tuple=True), layout)
+    if not all_of_them:
+        found, means = means, means.new_zeros(len(queries), *means.shape[1:])
+        means[wanted.flatten()] = found
+    return _picture(means, batch, down, right)[..., :height, :width]
 
 
 def _table(features: Tensor, source_bias: Tensor, log_n: Tensor, values: Tensor, windows: Sequence[int]) -> Tensor:
@@ -268,14 +271,13 @@ def _table(features: Tensor, source_bias: Tensor, log_n: Tensor, values: Tensor,
 
 
 def _blocks(picture: Tensor) -> Tensor:
-    """(B, C, H, W) -> (B, H / BLOCK, W / BLOCK, BLOCK^2, C)."""
+    """(B, C, H, W) -> (B * H / BLOCK * W / BLOCK, BLOCK^2, C)."""
     batch, channels, height, width = picture.shape
     split = picture.view(batch, channels, height // BLOCK, BLOCK, width // BLOCK, BLOCK)
-    return split.permute(0, 2, 4, 3, 5, 1).reshape(batch, height // BLOCK, width // BLOCK, BLOCK**2, channels)
+    return split.permute(0, 2, 4, 3, 5, 1).reshape(-1, BLOCK**2, channels)
 
 
-def _picture(blocks: Tensor) -> Tensor:
+def _picture(blocks: Tensor, batch: int, down: int, right: int) -> Tensor:
     """The inverse of `_blocks`."""
-    batch, down, right, _, channels = blocks.shape
-    split = blocks.view(batch, down, right, BLOCK, BLOCK, channels)
-    return split.permute(0, 5, 1, 3, 2, 4).reshape(batch, channels, down * BLOCK, right * BLOCK)
+    split = blocks.view(batch, down, right, BLOCK, BLOCK, blocks.shape[-1])
+    return split.permute(0, 5, 1, 3, 2, 4).reshape(batch, -1, down * BLOCK, right * BLOCK)

@@ -209,7 +209,7 @@ FAST = Config(
     glare_in_cells=0.25,
 )
 
-# `fast` with more channels: most of its time goes into the taps of its kernels, which stay.
+# `fast` with more channels; samples, partition and kernels stay.
 HIGH = replace(
     FAST,
     name="high",

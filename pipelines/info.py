@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from deep_io.errors import LbmcError
 from deep_io.header import Header, read_headers
 from deep_io.path_samples import PathSamples, SampleReader
 from deep_io.role_matching import map_roles
+from deep_io.sequences import expand, is_sequence
 from pipelines.decisions import decide, zero_roles
 from pipelines.options import DepthKind, NormalSpace, WeightingName
 from pipelines.survey import Survey, Surveyor
@@ -162,6 +164,11 @@ class RefusedFile:
         """The same for a reader."""
         roles = ["roles", *(f"  {line}" for line in self.mapping)] if self.mapping else []
         return [self.path, *_header_lines(self.headers, None), *roles, "a denoising job would refuse it"]
+
+
+def first_file(source: str | os.PathLike[str]) -> Path:
+    """The file itself; of a sequence its first frame, by which a job decides. Raises what `expand` does."""
+    return expand(source)[0].source if is_sequence(source) else Path(source)
 
 
 def refused_file(

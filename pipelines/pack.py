@@ -110,7 +110,8 @@ class PackReport:
         """The report as text."""
         mended = [f"{self.target}: {count} samples {_REPAIRED.get(role, f'without finite {role}')}"
                   for role, count in sorted(self.repairs.items()) if count]
-        return [f"{self.target}: {self.samples} samples per pixel", *self.mapping.lines(), *self.notes, *mended]
+        held = f"{self.samples} sample{'s' if self.samples != 1 else ''} per pixel"
+        return [f"{self.target}: {held}", *self.mapping.lines(), *self.notes, *mended]
 
 
 def plan(sources: Sequence[PathLike], target: PathLike, seeds: str | None = None, frames: str | None = None

@@ -21,7 +21,15 @@ from model.metrics import common_scale, geometric_mean, tone_mapped
 from pipelines.bench.charts import Line, Mark, Style, bars, lines, number, scatter
 from pipelines.bench.methods import STAGES, MethodSpec
 from pipelines.bench.results import Results, pareto
-from pipelines.bench.tables import FULL_HD, Table, all_tables, front_points, memory_frames, protocol_lines
+from pipelines.bench.tables import (
+    FULL_HD,
+    Table,
+    all_tables,
+    front_points,
+    memory_frames,
+    per_pixel,
+    protocol_lines,
+)
 
 Image = NDArray[np.floating[Any]]
 
@@ -135,7 +143,7 @@ def _charts(results: Results) -> list[str]:
 
 def _scenes(results: Results, samples: int) -> str:
     count = len(results.scenes_of(samples))
-    return f"{count} scene{'s' if count != 1 else ''} with {samples} samples per pixel"
+    return f"{count} scene{'s' if count != 1 else ''} with {per_pixel(samples)}"
 
 
 def _scatter(results: Results, samples: int, style: Mapping[str, Style]) -> str:

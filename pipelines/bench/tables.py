@@ -55,6 +55,11 @@ class Table:
         return f"## {self.title}\n\n" + "\n".join(lines) + note + "\n"
 
 
+def per_pixel(samples: int) -> str:
+    """The words "8 samples per pixel"."""
+    return f"{samples} sample{'s' if samples != 1 else ''} per pixel"
+
+
 def all_tables(results: Results) -> list[Table]:
     """Every table that the results fill, in the order of the page."""
     tables = []
@@ -88,7 +93,7 @@ def methods_table(results: Results, samples: int) -> Table:
         note += f" MiB is peak memory on {memory_frames(results)}."
     errors = ("relMSE", spread_name(count), "trimmed", "SMAPE", "PSNR", "SSIM", "FLIP", "energy")
     head = ("method", *errors, "CPU s", "wall s", "MiB")
-    return Table(f"{count} scene{'s' if count != 1 else ''} with {samples} samples per pixel", head, rows, note)
+    return Table(f"{count} scene{'s' if count != 1 else ''} with {per_pixel(samples)}", head, rows, note)
 
 
 def unbiased_table(results: Results, samples: int) -> Table:
@@ -107,7 +112,7 @@ def unbiased_table(results: Results, samples: int) -> Table:
     note = ("relMSE against the mean of both halves of the reference / free of the noise of that mean, as two "
             "independent halves give it (it may be slightly negative). Means are arithmetic for both. The floor is "
             "what the reference's own noise adds: below it, plain relMSE tells no image from a perfect one.")
-    return Table(f"relMSE free of the reference's noise, {samples} samples per pixel", ("scene", "floor", *names), rows,
+    return Table(f"relMSE free of the reference's noise, {per_pixel(samples)}", ("scene", "floor", *names), rows,
                  note)
 
 
@@ -141,7 +146,7 @@ def stages_table(results: Results, samples: int) -> Table:
             f"{STAGES['filter']!r}. Flattening stands for what a renderer would have handed over, so it counts for no "
             "method. The paper, at 1080p with 8 samples on an RTX 2080 Ti, OPTIMIZED: reducer 3.9 ms, U-Net 18.8, "
             "partitioner 10.2, filtering 5.3.")
-    return Table(f"Where the time goes, at {samples} samples per pixel",
+    return Table(f"Where the time goes, at {per_pixel(samples)}",
                  ("method", *(STAGES[stage] for stage in stages), "all"), rows, note)
 
 

@@ -118,3 +118,16 @@ def test_a_file_that_a_job_would_refuse_is_shown_before_it_is_refused(lbmc: Runn
     assert "roles" not in run.out
     assert "--map radiance=LAYER" in run.err
     assert json.loads(lbmc("info", source, "--json").out)["parts"][0]["channels"] == {"Z": "float32"}
+
+
+def test_of_a_sequence_the_first_frame_is_shown(lbmc: Runner, tmp_path: Path) -> None:
+    for number in (1003, 1002):
+        write_scene(tmp_path / f"shot.{number}.exr", noisy_scene(number, SMALL))
+    run = lbmc("info", tmp_path / "shot.####.exr")
+    assert (run.code, run.err) == (0, "")
+    assert run.out == lbmc("info", tmp_path / "shot.1002.exr").out
+
+
+def test_a_sequence_without_frames_is_told(lbmc: Runner, tmp_path: Path) -> None:
+    run = lbmc("info", tmp_path / "shot.####.exr")
+    assert (run.code, run.err) == (3, f"ERROR: {tmp_path}/shot.####.exr: no file matches the pattern\n")
