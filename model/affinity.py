@@ -137,17 +137,19 @@ def _axis_logs(size: int, window: int, phases: int, span: Tensor, like: Tensor) 
 class _BlockFilter(torch.autograd.Function):
     """Attention of blocks of targets, with a derivative that computes its weights anew: all of them would fill memory.
 
-    queries (N, BLOCK^2, K), table (rows, K + C): a logit is a query times the first K columns plus `splines`, a value
-    the other C. Blocks are numbered y, x in their image, all (N,). -> (N, BLOCK^2, C)
+    queries (N, BLOCK^2, K): twice a target's features, 1, its preference of each level; table (rows, K + C): a cell's
+    features, its own logit, 1 at its level and 0 at the others, then its values. A logit is the product of a query and
+    a key less the square of the key's features, plus `splines`. Blocks are numbered y, x in their image, all (N,).
+    -> (N, BLOCK^2, C)
     """
 
     @staticmethod
     def forward(ctx: Any, queries: Tensor, table: Tensor, blocks: Sequence[Tensor], windows: _Windows) -> Tensor:
         keys = queries.shape[2]
         out = queries.new_empty(*queries.shape[:2], table.shape[1] - keys)
-        for part in _chunks(len(queries), CHUNK.get(queries.device.type, CHUNK["cuda"])):
-            sources = _sources(table, blocks, windows, part)
-            torch.bmm(_weights(queries[part], sources, blocks, windows, part), sources[..., keys:], out=out[part])
+        for part in _parts(queries):
+            _, sources, weights = _attend(queries[part], table, [number[part] for number in blocks], windows)
+            torch.bmm(weights, sources[..., keys:], out=out[part])
         ctx.save_for_backward(queries, table, out, *blocks)
         ctx.windows = windows
         return out
@@ -156,21 +158,22 @@ class _BlockFilter(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> Any:
         queries, table, out, *blocks = ctx.saved_tensors
         windows, keys = ctx.windows, queries.shape[2]
+        own = keys - len(windows.sizes) - 1  # the column of a source's own logit, behind its features
         common = (grad * out).sum(2, keepdim=True)  # subtracted by the softmax's derivative
         to_queries, to_table = torch.empty_like(queries), torch.zeros_like(table)
         for large in _chunks(len(queries), BACKWARD_CHUNK):
             rows = windows.sources(*(number[large] for number in blocks))
             to_sources = table.new_empty(*rows.shape, table.shape[1])
-            for small in _chunks(len(rows), CHUNK.get(queries.device.type, CHUNK["cuda"])):
+            for small in _parts(queries[large]):
                 part = slice(large.start + small.start, large.start + small.stop)
-                sources = _sources(table, blocks, windows, part)
-                weights = _weights(queries[part], sources, blocks, windows, part)
+                asked, sources, weights = _attend(queries[part], table, [number[part] for number in blocks], windows)
                 torch.bmm(weights.transpose(1, 2), grad[part], out=to_sources[small, :, keys:])
                 inner = torch.baddbmm(-common[part].expand_as(weights), grad[part],
                                       sources[..., keys:].transpose(1, 2)).mul_(weights)  # d loss / d logit
-                # keys of empty cells are -inf; no weight, no derivative
+                # own logits of empty cells are -inf; no weight, no derivative
                 torch.bmm(inner, sources[..., :keys].nan_to_num_(neginf=0.0), out=to_queries[part])
-                torch.bmm(inner.transpose(1, 2), queries[part], out=to_sources[small, :, :keys])
+                torch.bmm(inner.transpose(1, 2), asked, out=to_sources[small, :, :keys])
+                to_sources[small, :, :own].addcmul_(sources[..., :own], to_sources[small, :, own : own + 1], value=-2.0)
             first, last = int(rows.min()), int(rows.max()) + 1
             summed = torch.ops.aten.embedding_dense_backward(to_sources, rows - first, last - first, -1, False)
             to_table[first:last] += summed
@@ -181,19 +184,28 @@ def _chunks(count: int, size: int) -> Iterator[slice]:
     return (slice(start, min(start + size, count)) for start in range(0, count, size))
 
 
-def _sources(table: Tensor, blocks: Sequence[Tensor], windows: _Windows, part: slice) -> Tensor:
-    """(N, S, K + C): what some of the blocks see."""
-    rows = windows.sources(*(number[part] for number in blocks))
-    return table.index_select(0, rows.flatten()).view(*rows.shape, -1)
+def _parts(queries: Tensor) -> Iterator[slice]:
+    return _chunks(len(queries), CHUNK.get(queries.device.type, CHUNK["cuda"]))
 
 
-def _weights(queries: Tensor, sources: Tensor, blocks: Sequence[Tensor], windows: _Windows, part: slice) -> Tensor:
-    """(N, BLOCK^2, S): weights that sum to 1, all 0 where no source is in reach."""
-    _, y, x = (number[part] for number in blocks)
+def _attend(queries: Tensor, table: Tensor, blocks: Sequence[Tensor], windows: _Windows
+            ) -> tuple[Tensor, Tensor, Tensor]:
+    """Queries (N, BLOCK^2, K) and sources (N, S, K + C) of some blocks, both with features relative to the mean of
+    their block's targets, so that digits go where they count; and weights (N, BLOCK^2, S) that sum to 1, all 0 where
+    no source is in reach."""
+    image, y, x = blocks
+    rows = windows.sources(image, y, x)
+    sources = table.index_select(0, rows.flatten()).view(*rows.shape, -1)
+    keys = queries.shape[2]
+    width = keys - len(windows.sizes) - 1
+    centre = queries[..., :width].mean(1, keepdim=True)  # twice that of the features
+    queries = torch.cat([queries[..., :width] - centre, queries[..., width:]], 2)
+    features = sources[..., :width].sub_(centre, alpha=0.5)
+    sources[..., width] -= features.square().sum(2)
     logits = windows.splines.index_select(0, windows.phase(y, x))
-    logits.baddbmm_(queries, sources[..., : queries.shape[2]].transpose(1, 2))
+    logits.baddbmm_(queries, sources[..., :keys].transpose(1, 2))
     weights = torch.softmax(logits, 2)
-    return weights.nan_to_num_(0.0) if bool(weights[..., 0].isnan().any()) else weights
+    return queries, sources, weights.nan_to_num_(0.0) if bool(weights[..., 0].isnan().any()) else weights
 
 
 def affinity_filter(
@@ -225,9 +237,6 @@ def affinity_filter(
         shape = (batch, *(math.ceil(side / ACTIVE_CELL) for side in (height, width)))
         if torch.is_grad_enabled() or active.shape != shape:
             raise ValueError(f"active cells {tuple(active.shape)}, expected {shape}, no gradient")
-    # Only differences of features count, and |f_t - f_s|^2 is computed as |f_t|^2 - 2 f_t f_s + |f_s|^2: what all
-    # features have in common would only cost digits.
-    features = features - features.detach().mean((2, 3), keepdim=True)
     size = max(BLOCK, 2 ** (len(windows) - 1))
     pad = (0, -width % size, 0, -height % size)
     if any(pad):
@@ -236,7 +245,6 @@ def affinity_filter(
         log_n = F.pad(log_n, pad, value=-torch.inf)
     layout = _Windows.of(windows, log_n.shape[1], log_n.shape[2], features)
     table = _table(features, source_bias, log_n, values, windows)
-    # a query is 2 f_t, 1 and v_t; a key f_s, the source's own logit and 1 at its level
     queries = _blocks(torch.cat([2 * features, torch.ones_like(features[:, :1]), target_preference], 1))
     down, right = (side // BLOCK for side in log_n.shape[1:])
     wanted = torch.ones(batch, down, right, dtype=torch.bool, device=log_n.device)
@@ -255,7 +263,10 @@ def affinity_filter(
 
 
 def _table(features: Tensor, source_bias: Tensor, log_n: Tensor, values: Tensor, windows: Sequence[int]) -> Tensor:
-    """(B * rows, K + C): what `_Windows` numbers the rows of. Keys: features, the source's own logit, its level."""
+    """(B * rows, K + C): what `_Windows` numbers the rows of; columns as in `_BlockFilter`.
+
+    E|f_t - f_s|^2 over a cell is the square of what its mean is off, and its variance, which is part of its own logit.
+    """
     planes = torch.cat([features, values, features.square().sum(1, keepdim=True)], 1)
     tables = []
     for number, window in enumerate(windows):
@@ -264,7 +275,8 @@ def _table(features: Tensor, source_bias: Tensor, log_n: Tensor, values: Tensor,
         level = torch.zeros_like(source_bias[..., : bias.shape[1], : bias.shape[2]])
         level[:, number] = 1
         border = [window // 2] * 4
-        own = F.pad(bias[:, None] - norm, border, value=-torch.inf)
+        variance = norm - feature.square().sum(1, keepdim=True)
+        own = F.pad(bias[:, None] - variance, border, value=-torch.inf)
         first, *rest = (F.pad(plane, border) for plane in (feature, level, value))
         tables.append(torch.cat([first, own, *rest], 1).flatten(2))
     return torch.cat(tables, 2).transpose(1, 2).reshape(-1, features.shape[1] + 1 + len(windows) + values.shape[1])

@@ -26,6 +26,7 @@ GLARE_START = 3.0  # log(1 + exposure L): radiance about 20 times the frame's mi
 BLACK = 1e-6  # of the frame's middle
 FLAT = 1e-3  # variance of the divisor, over its square, that says little about the radiance
 NOISE_WINDOW = 3  # pixels; so far around a target the noise of divisors is measured
+ROUNDING = 1e-6  # of a divisor's mean square: what single precision may leave of a spread that is none
 KNOWN = 1e-3  # less than this of a window's samples but the first of each pixel: no spread was seen
 DIVISOR_GUIDE_SCALE = 6.0  # the divisor's own, sharper kernel
 
@@ -188,7 +189,7 @@ def _noise(by: Tensor, measured: Tensor, log_w: Tensor) -> Tensor:
     stratified it is an upper bound. `by` (B*L, 3, H, W) and `measured`, of `noise_values`, per unit of own weight.
     """
     squared, weight = measured.split(1, 1)
-    spread = (squared - _mean_product(by, by)).clamp_min(0)
+    spread = (squared * (1 - ROUNDING) - _mean_product(by, by)).clamp_min(0)
     there = weight > 0
     # one over the number of samples: 1 says nothing of the spread
     lone = torch.where(there, (weight / torch.exp(log_w)[:, None].clamp_min(1e-30)).clamp(0, 1), 1)
